@@ -1,0 +1,44 @@
+"""The contract of a backbone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.types import Image, Prediction
+
+
+class Backbone(Protocol):
+    """A frozen model of the world: the images of one window in, geometry out."""
+
+    @property
+    def name(self) -> str:
+        """Name it as the settings do."""
+        ...
+
+    def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Return the (height, width) at which it wants images of (height, width) ``size``."""
+        ...
+
+    def predict(
+        self,
+        images: Sequence[Image],
+        frames: NDArray[np.int64],
+        intrinsics: NDArray[np.float64] | None,
+    ) -> Prediction:
+        """Predict one window.
+
+        What it cannot do, it says in ``status`` and ``warnings``; it never raises for bad images.
+
+        Args:
+            images: N images (H, W, 3) RGB uint8 of ``image_size``.
+            frames: (N,) rising indices in the sequence.
+            intrinsics: (3, 3) in pixels of these images; None: unknown, to be estimated.
+
+        Returns:
+            The prediction, at a depth-map size of the backbone's choosing.
+        """
+        ...

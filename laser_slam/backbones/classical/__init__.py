@@ -1,0 +1,1 @@
+"""Geometry on the CPU: tracks, bundle adjustment, plane sweep."""

@@ -1,0 +1,68 @@
+"""The pinhole camera: x right, y down, z forward; pixel centres at integer coordinates."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def intrinsics_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
+    """Return the (3, 3) intrinsics in pixels."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def intrinsics_from_fov(fov_deg: float, height: int, width: int) -> Array:
+    """Return intrinsics with square pixels and the principal point in the image's centre.
+
+    Args:
+        fov_deg: horizontal field of view in degrees.
+        height: image height in pixels.
+        width: image width in pixels.
+
+    >>> float(intrinsics_from_fov(90.0, 100, 200)[0, 0].round(6))
+    100.0
+    """
+    focal = 0.5 * width / np.tan(0.5 * np.radians(fov_deg))
+    return intrinsics_matrix(
+        round(float(focal), 9), round(float(focal), 9), (width - 1) / 2, (height - 1) / 2
+    )
+
+
+def resize_intrinsics(intrinsics: Array, size: tuple[int, int], new_size: tuple[int, int]) -> Array:
+    """Scale (..., 3, 3) intrinsics of a (height, width) image to another size, per axis.
+
+    Pixel centres are at integers, so the image spans -0.5 to width - 0.5.
+    """
+    fy, fx = new_size[0] / size[0], new_size[1] / size[1]
+    out = np.array(intrinsics, dtype=np.float64)
+    out[..., 0, :2] *= fx
+    out[..., 1, 1] *= fy
+    out[..., 0, 2] = (intrinsics[..., 0, 2] + 0.5) * fx - 0.5
+    out[..., 1, 2] = (intrinsics[..., 1, 2] + 0.5) * fy - 0.5
+    return out
+
+
+def rays(intrinsics: Array, height: int, width: int) -> Array:
+    """Return (height, width, 3) directions of the pixels in camera axes, with z = 1."""
+    x = (np.arange(width) - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (np.arange(height) - intrinsics[1, 2]) / intrinsics[1, 1]
+    out = np.ones((height, width, 3))
+    out[..., 0] = x
+    out[..., 1] = y[:, None]
+    return out
+
+
+def unproject(depth: NDArray[np.float32], intrinsics: Array) -> Array:
+    """Return (H, W, 3) points in camera axes of a (H, W) depth map; NaN where depth is unknown."""
+    height, width = depth.shape
+    return rays(intrinsics, height, width) * depth[..., None].astype(np.float64)
+
+
+def project(points: Array, intrinsics: Array) -> Array:
+    """Project (..., 3) points in camera axes to (..., 2) pixels; NaN at or behind the camera."""
+    z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+    u = intrinsics[0, 0] * points[..., 0] / z + intrinsics[0, 2]
+    v = intrinsics[1, 1] * points[..., 1] / z + intrinsics[1, 2]
+    return np.stack([u, v], axis=-1)

@@ -1,0 +1,189 @@
+"""Every setting: its default, its unit, its limits. Nowhere else."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from laser_slam.errors import ConfigError
+
+
+class _Section(BaseModel):
+    """A frozen group of settings that refuses unknown names."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class WindowsConfig(_Section):
+    """Keyframes and overlapping windows."""
+
+    size: int = Field(20, ge=3, description="keyframes per window")
+    overlap: int = Field(5, ge=1, description="keyframes shared by neighbouring windows")
+    min_parallax_px: float = Field(
+        1.5, ge=0, description="motion that makes a keyframe, rotation removed; px at 640 wide"
+    )
+    max_flow_px: float = Field(
+        40.0, gt=0, description="motion with rotation that makes a keyframe anyway; px at 640 wide"
+    )
+
+    @model_validator(mode="after")
+    def _overlap_leaves_new_frames(self) -> Self:
+        if self.overlap >= self.size:
+            raise ValueError(
+                f"overlap ({self.overlap}) must be smaller than size ({self.size}): "
+                "lower windows.overlap or raise windows.size"
+            )
+        return self
+
+
+class ClassicalConfig(_Section):
+    """The default backbone: tracks, bundle adjustment, plane sweep; on the CPU."""
+
+    max_width: int = Field(1280, ge=160, description="images wider than this are reduced, px")
+
+
+class BackboneConfig(_Section):
+    """The source of depth, poses and confidence."""
+
+    name: str = Field("classical", description="one of the names in laser_slam.backbones.BACKBONES")
+    classical: ClassicalConfig = ClassicalConfig()
+
+
+class RegistrationConfig(_Section):
+    """The Sim(3) between neighbouring windows."""
+
+    scale: Literal["log_huber", "huber", "l1", "closed_form"] = Field(
+        "log_huber", description="estimator of the scale; closed_form: the paper's 'w/o IRLS'"
+    )
+    rigid: Literal["anchors", "points"] = Field(
+        "anchors", description="what gives rotation and translation; points: 'w/o Anchor'"
+    )
+    anchor_length: Literal["spread", "unit"] = Field(
+        "spread", description="length of the anchors' axes: spread of the centres, or the paper's 1"
+    )
+    min_pixels: int = Field(100, ge=10, description="confident pixels that the scale needs")
+
+
+class FusionConfig(_Section):
+    """Submaps to one coloured cloud."""
+
+    min_confidence: float = Field(0.5, ge=0, le=1, description="pixels below it stay out")
+
+
+class RunConfig(_Section):
+    """The run itself."""
+
+    seed: int = Field(0, ge=0, description="of everything that draws random numbers")
+    workers: int = Field(0, ge=0, description="threads; 0: one per core")
+
+
+class Config(_Section):
+    """All settings of a run."""
+
+    windows: WindowsConfig = WindowsConfig()
+    backbone: BackboneConfig = BackboneConfig()
+    registration: RegistrationConfig = RegistrationConfig()
+    fusion: FusionConfig = FusionConfig()
+    run: RunConfig = RunConfig()
+
+
+def load_config(
+    name: str | None = None, file: Path | None = None, assignments: Sequence[str] = ()
+) -> Config:
+    """Layer the settings: code < ``configs/<name>.yaml`` < ``file`` < ``key=value`` assignments.
+
+    Args:
+        name: of a settings file that ships with laser-slam, such as ``kitti``.
+        file: a settings file of the user's.
+        assignments: ``section.key=value``, the value in YAML.
+
+    Raises:
+        ConfigError: a file is missing or no YAML, a setting is unknown or out of its limits.
+
+    >>> load_config(assignments=["windows.size=30"]).windows.size
+    30
+    """
+    settings: dict[str, Any] = {}
+    if name is not None:
+        _merge(settings, _read_yaml(shipped_configs() / f"{name}.yaml"))
+    if file is not None:
+        _merge(settings, _read_yaml(file))
+    for assignment in assignments:
+        _merge(settings, _parse_assignment(assignment))
+    return _validate(settings)
+
+
+def shipped_configs() -> Path:
+    """Return the folder of the settings files that ship with laser-slam."""
+    installed = Path(__file__).parent / "configs"
+    return installed if installed.is_dir() else Path(__file__).parents[1] / "configs"
+
+
+def dump_config(config: Config) -> str:
+    """Write all settings as YAML, defaults included."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def setting_names(model: type[BaseModel] = Config, prefix: str = "") -> Iterator[str]:
+    """List every setting as ``section.key``."""
+    for key, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from setting_names(field.annotation, f"{prefix}{key}.")
+        else:
+            yield prefix + key
+
+
+def _validate(settings: dict[str, Any]) -> Config:
+    try:
+        return Config.model_validate(settings)
+    except ValidationError as error:
+        raise ConfigError("; ".join(_explain(dict(item)) for item in error.errors())) from error
+
+
+def _explain(item: dict[str, Any]) -> str:
+    name = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(name, list(setting_names()), n=1)
+        return f"{name}: no such setting" + (f" (did you mean {near[0]}?)" if near else "")
+    text = str(item["msg"]).removeprefix("Value error, ")
+    return f"{name}: {text[0].lower()}{text[1:]}, got {item['input']!r}"[:300]
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"cannot read settings file {path}: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from error
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path} must hold sections such as 'windows:', got {content!r:.60}")
+    return content
+
+
+def _parse_assignment(assignment: str) -> dict[str, Any]:
+    name, equals, value = assignment.partition("=")
+    if not equals:
+        raise ConfigError(f"--set wants section.key=value, got '{assignment}'")
+    try:
+        settings: Any = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{name}: '{value}' is no YAML value") from error
+    for key in reversed(name.strip().split(".")):
+        settings = {key: settings}
+    return dict(settings)
+
+
+def _merge(base: dict[str, Any], over: dict[str, Any]) -> None:
+    for key, value in over.items():
+        if isinstance(value, dict) and isinstance(base.get(key), dict):
+            _merge(base[key], value)
+        else:
+            base[key] = value

@@ -1,0 +1,1 @@
+"""A generated street world: images, depth and poses along any path."""

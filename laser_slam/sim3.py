@@ -1,0 +1,174 @@
+"""Similarity transforms: points of one frame to another by ``s * R @ p + t``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.errors import DegenerateGeometryError
+
+Array = NDArray[np.float64]
+
+
+def _identity_rotation() -> Array:
+    return np.eye(3)
+
+
+def _zero_translation() -> Array:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Sim3:
+    """Map points of one frame to another: ``s * rotation @ p + translation``, in float64.
+
+    Named ``b_from_a``; composes with ``@`` as functions do.
+
+    Attributes:
+        scale: units of the target per unit of the source, > 0.
+        rotation: (3, 3) in SO(3).
+        translation: (3,) in units of the target.
+
+    Raises:
+        DegenerateGeometryError: not finite, scale not positive, or rotation not orthonormal.
+
+    >>> b_from_a = Sim3(scale=2.0, translation=np.array([1.0, 0.0, 0.0]))
+    >>> (b_from_a @ b_from_a.inverse()).scale
+    1.0
+    >>> b_from_a.apply(np.ones((1, 3)))
+    array([[3., 2., 2.]])
+    """
+
+    scale: float = 1.0
+    rotation: Array = field(default_factory=_identity_rotation)
+    translation: Array = field(default_factory=_zero_translation)
+
+    def __post_init__(self) -> None:
+        """Take float64 copies and refuse what is no similarity."""
+        object.__setattr__(self, "scale", float(self.scale))
+        object.__setattr__(self, "rotation", np.array(self.rotation, dtype=np.float64))
+        object.__setattr__(self, "translation", np.array(self.translation, dtype=np.float64))
+        finite = np.isfinite(self.rotation).all() and np.isfinite(self.translation).all()
+        if not (finite and np.isfinite(self.scale) and self.scale > 0):
+            raise DegenerateGeometryError(
+                f"a Sim(3) needs finite numbers and a positive scale, got scale {self.scale}"
+            )
+        if not np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-6):
+            raise DegenerateGeometryError("a Sim(3) needs an orthonormal rotation")
+
+    @classmethod
+    def from_matrix(cls, matrix: Array) -> Sim3:
+        """Read a (4, 4) matrix ``[s R, t; 0, 1]``."""
+        scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        return cls(scale, matrix[:3, :3] / scale, matrix[:3, 3])
+
+    def matrix(self) -> Array:
+        """Return the (4, 4) matrix ``[s R, t; 0, 1]``."""
+        out = np.eye(4)
+        out[:3, :3] = self.scale * self.rotation
+        out[:3, 3] = self.translation
+        return out
+
+    def inverse(self) -> Sim3:
+        """Return ``a_from_b`` of this ``b_from_a``."""
+        rotation = self.rotation.T
+        return Sim3(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+    def __matmul__(self, other: Sim3) -> Sim3:
+        """Compose: ``(c_from_b @ b_from_a)`` maps a to c."""
+        return Sim3(
+            self.scale * other.scale,
+            orthonormal(self.rotation @ other.rotation),
+            self.scale * (self.rotation @ other.translation) + self.translation,
+        )
+
+    def apply(self, points: Array) -> Array:
+        """Map (..., 3) points."""
+        return self.scale * (points @ self.rotation.T) + self.translation
+
+    def apply_poses(self, source_from_cam: Array) -> Array:
+        """Map (..., 4, 4) rigid camera poses; the results are rigid, in units of the target."""
+        out = np.array(source_from_cam, dtype=np.float64)
+        out[..., :3, :3] = self.rotation @ source_from_cam[..., :3, :3]
+        out[..., :3, 3] = self.apply(source_from_cam[..., :3, 3])
+        return out
+
+
+def orthonormal(matrix: Array) -> Array:
+    """Return the rotation nearest to (3, 3) ``matrix`` in Frobenius norm."""
+    u, _, vt = np.linalg.svd(matrix)
+    u[:, -1] *= np.sign(np.linalg.det(u @ vt))
+    return np.asarray(u @ vt)
+
+
+def rotation_log(rotation: Array) -> Array:
+    """Return the rotation vectors (..., 3), in radians, of (..., 3, 3) rotations."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (import time of the command line)
+
+    flat = Rotation.from_matrix(np.reshape(rotation, (-1, 3, 3))).as_rotvec()
+    return np.asarray(flat.reshape(*rotation.shape[:-2], 3))
+
+
+def rotation_exp(vector: Array) -> Array:
+    """Return the rotations (..., 3, 3) of rotation vectors (..., 3) in radians."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+
+    flat = Rotation.from_rotvec(np.reshape(vector, (-1, 3))).as_matrix()
+    return np.asarray(flat.reshape(*vector.shape[:-1], 3, 3))
+
+
+def umeyama(source: Array, target: Array, *, with_scale: bool = True) -> Sim3:
+    """Fit the similarity that maps ``source`` on ``target`` in the least-squares sense.
+
+    Args:
+        source: (N, 3) points.
+        target: (N, 3) the same points in the other frame.
+        with_scale: False fits a rigid motion (scale 1): the Kabsch algorithm.
+
+    Returns:
+        ``target_from_source``.
+
+    Raises:
+        DegenerateGeometryError: fewer than 3 points, or all source points in one place.
+
+    Reference: Umeyama, PAMI 1991.
+    """
+    if len(source) < 3:
+        raise DegenerateGeometryError(f"an alignment needs 3 points, got {len(source)}")
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    source_c, target_c = source - source_mean, target - target_mean
+    spread = float((source_c**2).sum())
+    if not np.isfinite(spread) or spread <= 0:
+        raise DegenerateGeometryError("an alignment needs points in more than one place")
+    u, singular, vt = np.linalg.svd(target_c.T @ source_c)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * sign) @ vt
+    scale = float((singular * sign).sum() / spread) if with_scale else 1.0
+    return Sim3(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+
+def interpolate_poses(times_s: Array, key_times_s: Array, world_from_key: Array) -> Array:
+    """Give every time a rigid pose: linear centre, spherical rotation; held beyond the ends.
+
+    Args:
+        times_s: (M,) seconds.
+        key_times_s: (N,) strictly rising seconds of the known poses, N >= 1.
+        world_from_key: (N, 4, 4) rigid.
+
+    Returns:
+        (M, 4, 4) ``world_from_cam``; a known pose comes back unchanged.
+    """
+    from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415
+
+    clipped = np.clip(times_s, key_times_s[0], key_times_s[-1])
+    out = np.tile(np.eye(4), (len(times_s), 1, 1))
+    if len(key_times_s) == 1:
+        out[:] = world_from_key[0]
+        return out
+    slerp = Slerp(key_times_s, Rotation.from_matrix(world_from_key[:, :3, :3]))
+    out[:, :3, :3] = slerp(clipped).as_matrix()
+    for axis in range(3):
+        out[:, axis, 3] = np.interp(clipped, key_times_s, world_from_key[:, axis, 3])
+    return out

@@ -1,0 +1,179 @@
+"""What the stages hand to each other. Axes: x right, y down, z forward."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.sim3 import Sim3
+
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of the sequence.
+
+    Attributes:
+        index: position in the sequence, from 0.
+        time_s: seconds; strictly rising over the sequence.
+        image: (H, W, 3) RGB; None: this frame could not be read.
+    """
+
+    index: int
+    time_s: float
+    image: Image | None
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Camera poses over time.
+
+    Attributes:
+        frames: (N,) rising frame indices.
+        times_s: (N,) seconds.
+        world_from_cam: (N, 4, 4) rigid, in world units.
+    """
+
+    frames: NDArray[np.int64]
+    times_s: NDArray[np.float64]
+    world_from_cam: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        """Refuse shapes that disagree and poses that are not finite."""
+        num = len(self.frames)
+        if self.times_s.shape != (num,) or self.world_from_cam.shape != (num, 4, 4):
+            raise ValueError(f"a trajectory of {num} frames needs as many times and 4x4 poses")
+        if not np.isfinite(self.world_from_cam).all():
+            raise ValueError("a trajectory must be finite")
+
+
+@dataclass(frozen=True)
+class SequenceInfo:
+    """What a data set knows of a sequence before its images are read.
+
+    Attributes:
+        name: short name, for the run folder and the report.
+        size: (height, width) of all images, in pixels.
+        num_frames: None when only reading to the end tells.
+        intrinsics: (3, 3) in pixels of the images; None: unknown.
+        intrinsics_source: where they come from, or why they are unknown, in words.
+        truth: poses in metres, for all frames or some; None: no ground truth.
+    """
+
+    name: str
+    size: tuple[int, int]
+    num_frames: int | None
+    intrinsics: NDArray[np.float64] | None
+    intrinsics_source: str
+    truth: Trajectory | None = None
+
+
+@dataclass(frozen=True)
+class Window:
+    """Consecutive keyframes that are given to the backbone at once.
+
+    Attributes:
+        index: position in the run, from 0.
+        frames: (N,) rising frame indices.
+        images: N images (H, W, 3) RGB, at the size that the backbone wants.
+    """
+
+    index: int
+    frames: NDArray[np.int64]
+    images: tuple[Image, ...]
+
+
+class WindowStatus(StrEnum):
+    """How much of a window a backbone could see."""
+
+    OK = "ok"
+    STATIC = "static"  # no motion: identity poses, no depth
+    ROTATION = "rotation"  # rotation without translation: rotations hold, no depth
+    FAILED = "failed"  # nothing holds: too few features, blank or corrupt frames
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A backbone's view of one window, in the window's own unit of length.
+
+    Attributes:
+        frames: (N,) rising indices in the sequence.
+        depth: (N, H, W) z along the optical axis; NaN: unknown.
+        confidence: (N, H, W) in [0, 1]; comparable within the window; 0 where depth is unknown.
+        window_from_cam: (N, 4, 4) rigid.
+        intrinsics: (N, 3, 3) in pixels of the depth map.
+        status: what holds; anything but OK has no depth at all.
+        warnings: what a person should know of this window, one sentence each.
+
+    Raises:
+        ValueError: shapes disagree, poses are not finite, depth is not positive.
+    """
+
+    frames: NDArray[np.int64]
+    depth: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    window_from_cam: NDArray[np.float64]
+    intrinsics: NDArray[np.float64]
+    status: WindowStatus = WindowStatus.OK
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check shapes and finiteness once, here."""
+        num = len(self.frames)
+        if self.depth.ndim != 3 or len(self.depth) != num:
+            raise ValueError(f"depth must be ({num}, H, W), got {self.depth.shape}")
+        if self.confidence.shape != self.depth.shape:
+            raise ValueError(f"confidence {self.confidence.shape}, depth {self.depth.shape}")
+        if self.window_from_cam.shape != (num, 4, 4) or self.intrinsics.shape != (num, 3, 3):
+            raise ValueError("poses must be (N, 4, 4) and intrinsics (N, 3, 3)")
+        if not (np.isfinite(self.window_from_cam).all() and np.isfinite(self.intrinsics).all()):
+            raise ValueError("poses and intrinsics must be finite")
+        if not np.isfinite(self.confidence).all() or not np.all(
+            self.depth[self.confidence > 0] > 0
+        ):
+            raise ValueError("confidence must be finite, and depth positive where it is above 0")
+
+
+@dataclass(frozen=True)
+class Registration:
+    """The Sim(3) between two windows that share frames, with its uncertainty.
+
+    Attributes:
+        previous_from_current: maps points of the current window to the previous one.
+        sigmas: (7,) standard deviations: rotation x, y, z (radians, previous window's axes),
+            translation x, y, z (previous window's units), log-scale.
+        num_pixels: pixels that voted for the scale; 0: the scale was assumed.
+        residual: median absolute log-ratio of the depths after alignment; NaN without pixels.
+        bridged: why this is a guess and no measurement; None: it was measured.
+    """
+
+    previous_from_current: Sim3
+    sigmas: NDArray[np.float64]
+    num_pixels: int
+    residual: float
+    bridged: str | None = None
+
+
+@dataclass(frozen=True)
+class Submap:
+    """A prediction with its place in the world.
+
+    Attributes:
+        index: of its window.
+        prediction: the backbone's view, never altered.
+        colors: (N, H, W, 3) RGB uint8, at the size of the depth maps.
+        world_from_window: its Sim(3) node.
+        is_owned: (N,) True where this window gives the frame to trajectory and map.
+        registration: to the window before; None for the first.
+    """
+
+    index: int
+    prediction: Prediction
+    colors: Image
+    world_from_window: Sim3
+    is_owned: NDArray[np.bool_]
+    registration: Registration | None

@@ -1,0 +1,55 @@
+"""Imports point upwards: a module uses only rows above its own, and stages never meet."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "laser_slam"
+ROOTS = ["errors", "sim3", "camera", "types", "config"]
+STAGES = ["datasets", "windows", "backbones", "registration", "fusion", "export", "evaluation"]
+STAGES += ["viewer", "report", "layers", "places", "pose_graph"]
+COMPOSITION = ["closures", "slam", "pipeline", "cli"]
+HEAVY = {"open3d", "torch", "gtsam", "numba", "cv2", "matplotlib", "scipy"}
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+def part_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imported_modules(path: Path, *, top_level_only: bool = False) -> list[str]:
+    tree = ast.parse(path.read_text())
+    nodes = tree.body if top_level_only else list(ast.walk(tree))
+    names = [alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names]
+    return names + [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
+
+
+def may_import(part: str) -> set[str]:
+    if part in ROOTS:
+        return set(ROOTS[: ROOTS.index(part)])
+    if part in STAGES:
+        return {*ROOTS, part}
+    return {*ROOTS, *STAGES, *COMPOSITION[: COMPOSITION.index(part)]}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_point_up_and_stages_do_not_meet(path: Path) -> None:
+    part = part_of(path)
+    if part == "__init__":
+        return
+    assert part in ROOTS + STAGES + COMPOSITION, f"{part} has no row in the design"
+    used = {name.split(".")[1] for name in imported_modules(path) if name.startswith("laser_slam.")}
+    assert used <= may_import(part)
+
+
+@pytest.mark.parametrize("name", [*ROOTS, "cli"])
+def test_the_command_line_starts_without_heavy_packages(name: str) -> None:
+    path = PACKAGE / f"{name}.py"
+    names = {module.split(".")[0] for module in imported_modules(path, top_level_only=True)}
+    assert not names & HEAVY
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_files_stay_small(path: Path) -> None:
+    assert len(path.read_text().splitlines()) <= 300
