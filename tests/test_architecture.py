@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "laser_slam"
-ROOTS = ["errors", "sim3", "camera", "types", "config"]
+ROOTS = ["errors", "dependencies", "sim3", "camera", "types", "config", "store"]
 STAGES = ["datasets", "windows", "backbones", "registration", "fusion", "export", "evaluation"]
 STAGES += ["viewer", "report", "layers", "places", "pose_graph"]
 COMPOSITION = ["closures", "slam", "pipeline", "cli"]

@@ -1,0 +1,42 @@
+"""Packages whose import needs help."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from typing import Any
+
+from laser_slam.errors import DependencyError
+
+
+@cache
+def import_open3d() -> Any:
+    """Import Open3D, whose wheel expects libusb on the system, which a new machine lacks.
+
+    A missing libusb is taken from the ``libusb-package`` wheel. Everything else must be there.
+
+    Raises:
+        DependencyError: Open3D or a system library that it needs is missing; says how to get it.
+    """
+    try:
+        ctypes.CDLL("libusb-1.0.so.0", mode=ctypes.RTLD_GLOBAL)
+    except OSError:
+        _preload_libusb()
+    try:
+        import open3d  # noqa: PLC0415  (slow, and not every command needs it)
+    except (ImportError, OSError) as error:
+        raise DependencyError(
+            f"Open3D cannot be loaded ({error}); install it and its system libraries: "
+            "pip install open3d; apt-get install libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1"
+        ) from error
+    return open3d
+
+
+def _preload_libusb() -> None:
+    try:
+        import libusb_package  # noqa: PLC0415
+    except ImportError:
+        return
+    path = libusb_package.get_library_path()
+    if path is not None:
+        ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
