@@ -177,3 +177,34 @@ class Submap:
     world_from_window: Sim3
     is_owned: NDArray[np.bool_]
     registration: Registration | None
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Coloured points: the dense map.
+
+    Attributes:
+        points: (N, 3) in world units.
+        colors: (N, 3) RGB uint8.
+        weights: (N,) summed confidence of the pixels behind each point.
+        voxel_size: edge of the voxels that the points were averaged in, in world units, which
+            is about their distance to each other; 0: unknown.
+
+    Raises:
+        ValueError: shapes disagree or a point is not finite.
+    """
+
+    points: NDArray[np.float64]
+    colors: NDArray[np.uint8]
+    weights: NDArray[np.float32]
+    voxel_size: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check shapes and finiteness once, here."""
+        num = len(self.points)
+        if self.points.shape != (num, 3) or self.colors.shape != (num, 3):
+            raise ValueError(f"points {self.points.shape}, colors {self.colors.shape}")
+        if self.weights.shape != (num,):
+            raise ValueError(f"a cloud of {num} points needs as many weights")
+        if not np.isfinite(self.points).all():
+            raise ValueError("the points of a cloud must be finite")
