@@ -3,12 +3,24 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
+import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+from numpy.typing import NDArray
 
 from laser_slam.errors import RunFolderError
+from laser_slam.types import Image, Prediction, WindowStatus
+
+FORMAT_VERSION = 1
+JPEG_QUALITY = 85
+
 
 _ADVICE = {
     errno.ENOSPC: "free some space, or choose another folder",
@@ -39,9 +51,112 @@ def atomic_write(path: Path) -> Iterator[Path]:
         reason = error.strerror or str(error)
         raise RunFolderError(f"cannot write {path}: {reason}; {advice}") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink()
 
 
 def _flush(path: Path) -> None:
     with path.open("rb+") as file:
         os.fsync(file.fileno())
+
+
+def save_prediction(path: Path, prediction: Prediction, colors: Image) -> Prediction:
+    """Write one window without pickle: the cache, the resume point and the replay's input.
+
+    Depth is kept to a relative 5e-4, confidence in steps of 1/255, colours as JPEG; poses and
+    intrinsics exactly. Depths beyond what float16 holds of the window's median become unknown.
+
+    Args:
+        path: the file to be, ``*.npz``.
+        prediction: a backbone's view of the window.
+        colors: (N, H, W, 3) RGB uint8, at the size of the depth maps.
+
+    Returns:
+        The prediction as ``load_prediction`` gives it back, so that a run that goes on with it
+        ends as one that was broken off and resumed.
+
+    Raises:
+        RunFolderError: the system could not write.
+    """
+    packed = _pack(prediction)
+    jpegs = [_encode_jpeg(image) for image in colors]
+    with atomic_write(path) as partial, partial.open("wb") as file:
+        np.savez(
+            file,
+            allow_pickle=False,
+            **packed,
+            jpeg=np.frombuffer(b"".join(jpegs), np.uint8),
+            jpeg_sizes=np.array([len(jpeg) for jpeg in jpegs], np.int64),
+        )
+    return _unpack(packed)
+
+
+def load_prediction(path: Path) -> tuple[Prediction, Image]:
+    """Read what ``save_prediction`` wrote.
+
+    Returns:
+        The prediction, and its (N, H, W, 3) RGB uint8 colours.
+
+    Raises:
+        RunFolderError: the file is missing, damaged or of another version.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {key: file[key] for key in file.files}
+        version = int(arrays["version"])
+        if version == FORMAT_VERSION:
+            return _unpack(arrays), _decode_jpegs(arrays["jpeg"], arrays["jpeg_sizes"])
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise RunFolderError(
+            f"cannot read window file {path}: {text}; delete it and run again"
+        ) from error
+    raise RunFolderError(
+        f"window file {path} has format {version}, this laser-slam reads {FORMAT_VERSION}; "
+        "delete its run folder and run again"
+    )
+
+
+def _pack(prediction: Prediction) -> dict[str, NDArray[Any]]:
+    known = prediction.depth[prediction.depth > 0]
+    unit = float(np.median(known)) if known.size else 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = (prediction.depth / np.float32(unit)).astype(np.float16)
+        # Outside float16's normal range the relative error would be anything.
+        lost = ~(np.isfinite(depth) & (np.abs(depth) >= np.finfo(np.float16).tiny))
+    depth[lost] = np.nan
+    confidence = np.where(lost, 0, np.rint(prediction.confidence * 255)).astype(np.uint8)
+    return {
+        "version": np.array(FORMAT_VERSION),
+        "frames": prediction.frames,
+        "depth": depth,
+        "unit": np.array(unit),
+        "confidence": confidence,
+        "window_from_cam": prediction.window_from_cam,
+        "intrinsics": prediction.intrinsics,
+        "status": np.array(prediction.status.value),
+        "warnings": np.array(prediction.warnings, dtype=np.str_),
+    }
+
+
+def _unpack(arrays: dict[str, NDArray[Any]]) -> Prediction:
+    return Prediction(
+        frames=arrays["frames"],
+        depth=arrays["depth"].astype(np.float32) * np.float32(arrays["unit"]),
+        confidence=arrays["confidence"].astype(np.float32) / np.float32(255),
+        window_from_cam=arrays["window_from_cam"],
+        intrinsics=arrays["intrinsics"],
+        status=WindowStatus(str(arrays["status"])),
+        warnings=tuple(str(warning) for warning in arrays["warnings"]),
+    )
+
+
+def _encode_jpeg(image: Image) -> bytes:
+    buffer = io.BytesIO()
+    PIL.Image.fromarray(image).save(buffer, "JPEG", quality=JPEG_QUALITY)
+    return buffer.getvalue()
+
+
+def _decode_jpegs(data: Image, sizes: NDArray[np.int64]) -> Image:
+    parts = np.split(data, np.cumsum(sizes)[:-1])
+    return np.stack([np.asarray(PIL.Image.open(io.BytesIO(part.tobytes()))) for part in parts])

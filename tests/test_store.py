@@ -1,0 +1,163 @@
+"""Files of the run folder appear whole or not at all, and give back what went in."""
+
+import errno
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from laser_slam.errors import RunFolderError
+from laser_slam.store import atomic_write, load_prediction, save_prediction
+from laser_slam.types import Image, Prediction, WindowStatus
+
+HEIGHT, WIDTH = 192, 640
+
+
+def a_prediction(
+    num: int = 3, height: int = HEIGHT, width: int = WIDTH, unit: float = 1.0, seed: int = 0
+) -> Prediction:
+    rng = np.random.default_rng(seed)
+    depth = unit * rng.lognormal(0, 2, (num, height, width)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = np.nan
+    confidence = np.where(np.isfinite(depth), rng.random(depth.shape), 0).astype(np.float32)
+    window_from_cam = np.tile(np.eye(4), (num, 1, 1))
+    window_from_cam[:, :3, 3] = unit * rng.normal(size=(num, 3))
+    intrinsics = np.tile(np.diag([500.1, 499.3, 1.0]), (num, 1, 1))
+    return Prediction(np.arange(num) * 4, depth, confidence, window_from_cam, intrinsics)
+
+
+def a_street(num: int = 3, height: int = HEIGHT, width: int = WIDTH) -> Image:
+    y, x = np.mgrid[:height, :width]
+    waves = [128 + 60 * np.sin(x / (9 + k)) + 60 * np.cos(y / (7 + k)) for k in range(3)]
+    noise = np.random.default_rng(0).normal(0, 4, (num, height, width, 3))
+    return np.clip(np.stack(waves, -1) + noise, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_a_prediction_survives_the_round_trip_in_any_unit(tmp_path: Path, unit: float) -> None:
+    written = replace(
+        a_prediction(unit=unit), status=WindowStatus.OK, warnings=("little motion", "größe")
+    )
+    save_prediction(tmp_path / "0.npz", written, a_street())
+    read, colors = load_prediction(tmp_path / "0.npz")
+    known = np.isfinite(written.depth)
+    assert np.array_equal(np.isfinite(read.depth), known)
+    assert np.abs(read.depth[known] / written.depth[known] - 1).max() <= 5e-4
+    assert np.abs(read.confidence - written.confidence).max() <= 0.5 / 255 + 1e-6
+    assert np.array_equal(read.window_from_cam, written.window_from_cam)
+    assert np.array_equal(read.intrinsics, written.intrinsics)
+    assert np.array_equal(read.frames, written.frames)
+    assert (read.status, read.warnings) == (written.status, written.warnings)
+    assert np.abs(colors.astype(float) - a_street()).mean() < 6
+
+
+@pytest.mark.parametrize("ratio", [1e-9, 1e9])
+def test_depths_out_of_range_become_unknown_and_never_wrong(tmp_path: Path, ratio: float) -> None:
+    written = a_prediction()
+    written.depth[0, 0, 0] = ratio
+    written.confidence[0, 0, 0] = 1
+    save_prediction(tmp_path / "0.npz", written, a_street())
+    read, _ = load_prediction(tmp_path / "0.npz")
+    assert np.isnan(read.depth[0, 0, 0])
+    assert read.confidence[0, 0, 0] == 0
+
+
+def test_a_window_without_depth_survives(tmp_path: Path) -> None:
+    blank = replace(
+        a_prediction(),
+        depth=np.full((3, HEIGHT, WIDTH), np.nan, np.float32),
+        confidence=np.zeros((3, HEIGHT, WIDTH), np.float32),
+        status=WindowStatus.STATIC,
+    )
+    save_prediction(tmp_path / "0.npz", blank, a_street())
+    read, _ = load_prediction(tmp_path / "0.npz")
+    assert read.status is WindowStatus.STATIC
+    assert np.isnan(read.depth).all()
+    assert read.warnings == ()
+
+
+def test_what_saving_returns_is_what_loading_gives(tmp_path: Path) -> None:
+    returned = save_prediction(tmp_path / "0.npz", a_prediction(), a_street())
+    read, _ = load_prediction(tmp_path / "0.npz")
+    assert np.array_equal(returned.depth, read.depth, equal_nan=True)
+    assert np.array_equal(returned.confidence, read.confidence)
+
+
+def test_a_frame_takes_less_than_half_a_megabyte(tmp_path: Path) -> None:
+    save_prediction(tmp_path / "0.npz", a_prediction(), a_street())
+    assert (tmp_path / "0.npz").stat().st_size / 3 <= 500_000
+
+
+@pytest.mark.parametrize("damage", ["cut", "bit", "text", "missing", "empty"])
+def test_a_damaged_window_file_is_named_with_what_to_do(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "000007.npz"
+    save_prediction(path, a_prediction(), a_street())
+    data = bytearray(path.read_bytes())
+    if damage == "cut":
+        path.write_bytes(data[: len(data) // 2])
+    elif damage == "bit":
+        data[len(data) // 2] ^= 1
+        path.write_bytes(data)
+    elif damage == "missing":
+        path.unlink()
+    else:
+        path.write_bytes(b"" if damage == "empty" else b"no window at all")
+    with pytest.raises(RunFolderError, match=r"000007\.npz.*delete it and run again"):
+        load_prediction(path)
+
+
+def test_a_file_of_another_version_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "0.npz"
+    save_prediction(path, a_prediction(), a_street())
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, allow_pickle=False, **{**arrays, "version": np.array(99)})
+    with pytest.raises(RunFolderError, match="has format 99"):
+        load_prediction(path)
+
+
+def test_a_written_file_replaces_the_old_one(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with atomic_write(path) as partial:
+        assert partial.suffix == ".txt"
+        partial.write_text("new")
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, error: type[BaseException]
+) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def write_half() -> None:
+        with atomic_write(path) as partial:
+            partial.write_text("half")
+            raise error
+
+    with pytest.raises(error):
+        write_half()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_full_disk_is_one_line_that_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_space(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("laser_slam.store.os.fsync", no_space)
+    with pytest.raises(RunFolderError, match=r"No space left on device; free some space"):
+        save_prediction(tmp_path / "0.npz", a_prediction(), a_street())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RunFolderError, match=r"No such file or directory; create its folder"):
+        save_prediction(tmp_path / "nowhere" / "0.npz", a_prediction(1), a_street(1))
