@@ -45,6 +45,13 @@ class ClassicalConfig(_Section):
     """The default backbone: tracks, bundle adjustment, plane sweep; on the CPU."""
 
     max_width: int = Field(1280, ge=160, description="images wider than this are reduced, px")
+    track_width: int = Field(640, ge=160, description="width at which corners are tracked, px")
+    track_patch: int = Field(7, ge=5, le=31, description="side of the tracked patch, px")
+    num_features: int = Field(600, ge=100, description="corners per frame")
+    max_backward_px: float = Field(0.7, gt=0, description="forward-backward gap of a good track")
+    context: int = Field(15, ge=0, description="earlier keyframes that steady a window's solution")
+    depth_width: int = Field(640, ge=96, description="width of the depth maps, px")
+    num_planes: int = Field(64, ge=16, le=256, description="inverse depths that are tried")
 
 
 class BackboneConfig(_Section):
@@ -73,6 +80,22 @@ class FusionConfig(_Section):
     """Submaps to one coloured cloud."""
 
     min_confidence: float = Field(0.5, ge=0, le=1, description="pixels below it stay out")
+    max_range: float = Field(
+        4.0, gt=0, description="depth beyond which pixels stay out, in median depths of the window"
+    )
+    edge_jump: float = Field(
+        0.05, gt=0, description="depth step between neighbours that makes an edge, in its depth"
+    )
+    stride: int = Field(1, ge=1, description="every so many-th row and column is used")
+    voxel_size: float = Field(
+        0.0, ge=0, description="edge of the averaging voxels in world units; 0: auto_voxel decides"
+    )
+    auto_voxel: float = Field(
+        0.005, gt=0, description="edge of the voxels, in median depths of the first good window"
+    )
+    min_observations: int = Field(
+        3, ge=1, description="frames that must see a voxel or its 26 neighbours; fewer: noise"
+    )
 
 
 class RunConfig(_Section):
