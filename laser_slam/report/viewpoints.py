@@ -1,0 +1,159 @@
+"""Where a camera must stand to show a cloud well."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.camera import intrinsics_from_fov, intrinsics_matrix
+from laser_slam.report.splat import Viewpoint
+from laser_slam.types import Cloud, Trajectory
+
+Array = NDArray[np.float64]
+
+_WIDTH_PX = 1200
+_SAMPLE = 200_000  # points that decide where a camera stands
+_MARGIN = 0.04  # of the picture, left free around the map
+_OUTLIERS = 0.4  # percent of the points, at each end of each axis, that need not be in the picture
+_BIRD_TURN_DEG, _BIRD_DROP_DEG, _BIRD_FOV_DEG = 25.0, 38.0, 40.0
+_DRIVER_FOV_DEG = 75.0
+_DRIVER_BACK, _DRIVER_UP = 0.25, 0.08  # of the median depth in view
+
+
+def from_above(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
+    """Look straight down, in parallel projection, so that the whole map fits.
+
+    The first camera's forward points up in the picture, or to the right where the map is taller
+    than wide, for a picture that fills the page.
+    """
+    down, forward = _down_and_forward(trajectory)
+    world_from_cam = _looking(down, -forward)
+    extent = _extent(cloud, trajectory, world_from_cam)
+    if extent[1, 1] - extent[0, 1] > 1.2 * (extent[1, 0] - extent[0, 0]):
+        world_from_cam = _looking(down, np.cross(down, forward))
+        extent = _extent(cloud, trajectory, world_from_cam)
+    low, high = extent
+    span = np.maximum(high - low, 1e-9)
+    scale = (1 - 2 * _MARGIN) * _WIDTH_PX / max(span[0], 0.8 * span[1])
+    height = int(np.clip(scale * span[1] + 2 * _MARGIN * _WIDTH_PX, 500, 1200))
+    middle = (low + high) / 2
+    world_from_cam[:3, 3] = world_from_cam[:3, :3] @ [middle[0], middle[1], low[2] - span[2]]
+    intrinsics = intrinsics_matrix(scale, scale, (_WIDTH_PX - 1) / 2, (height - 1) / 2)
+    return Viewpoint(world_from_cam, intrinsics, (height, _WIDTH_PX), parallel=True)
+
+
+def from_bird(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
+    """Look down at a slant, from behind the start and aside, so that the whole map fits."""
+    down, _ = _down_and_forward(trajectory)
+    along = _main_direction(trajectory, cloud, down)
+    turn, drop = np.radians(_BIRD_TURN_DEG), np.radians(_BIRD_DROP_DEG)
+    aside = np.cross(down, along)
+    level = np.cos(turn) * along + np.sin(turn) * aside
+    look = np.cos(drop) * level + np.sin(drop) * down
+    world_from_cam = _looking(look, down)
+    size = (780, _WIDTH_PX)
+    intrinsics = intrinsics_from_fov(_BIRD_FOV_DEG, *size)
+    local = _local(cloud, trajectory, world_from_cam)
+    world_from_cam[:3, 3] = world_from_cam[:3, :3] @ _fitting_center(local, intrinsics, size)
+    return Viewpoint(world_from_cam, intrinsics, size)
+
+
+def from_driver(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
+    """Look along the camera, from a little behind and above, where it sees most of the map."""
+    size = (675, _WIDTH_PX)
+    intrinsics = intrinsics_from_fov(_DRIVER_FOV_DEG, *size)
+    points = _sample(cloud)
+    candidates = np.linspace(0, len(trajectory.frames) - 1, 12).astype(int)
+    seen = [_in_view(points, trajectory.world_from_cam[i], intrinsics, size) for i in candidates]
+    best = int(np.argmax([len(depth) for depth in seen]))
+    world_from_cam = trajectory.world_from_cam[candidates[best]].copy()
+    depth = float(np.median(seen[best])) if len(seen[best]) else 1.0
+    back, up = _DRIVER_BACK * depth, _DRIVER_UP * depth
+    world_from_cam[:3, 3] -= back * world_from_cam[:3, 2] + up * world_from_cam[:3, 1]
+    return Viewpoint(world_from_cam, intrinsics, size, near=0.6 * back)
+
+
+def _looking(look: Array, down: Array) -> Array:
+    """Return a (4, 4) camera at the origin that looks along ``look`` with ``down`` downwards."""
+    z = look / np.linalg.norm(look)
+    y = down - (down @ z) * z
+    y /= np.linalg.norm(y)
+    world_from_cam = np.eye(4)
+    world_from_cam[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
+    return world_from_cam
+
+
+def _down_and_forward(trajectory: Trajectory) -> tuple[Array, Array]:
+    """Return unit vectors: the mean down of the cameras, and level forward of the first one."""
+    down = trajectory.world_from_cam[:, :3, 1].mean(axis=0)
+    if np.linalg.norm(down) < 0.1:  # upside down as often as upright
+        down = trajectory.world_from_cam[0, :3, 1].copy()
+    down /= np.linalg.norm(down)
+    forward = trajectory.world_from_cam[0, :3, 2]
+    level = forward - (forward @ down) * down
+    if np.linalg.norm(level) < 0.1:  # the first camera looks down
+        level = np.cross(trajectory.world_from_cam[0, :3, 0], down)
+    return down, level / np.linalg.norm(level)
+
+
+def _main_direction(trajectory: Trajectory, cloud: Cloud, down: Array) -> Array:
+    """Return the level unit vector along which the map is longest, ahead of the first cameras."""
+    points = np.concatenate([_sample(cloud)[::10], trajectory.world_from_cam[:, :3, 3]])
+    level = points - np.outer(points @ down, down)
+    level -= level.mean(axis=0)
+    _, vectors = np.linalg.eigh(level.T @ level + 1e-12 * np.eye(3) - np.outer(down, down) * 1e-9)
+    along = vectors[:, -1] - (vectors[:, -1] @ down) * down
+    _, forward = _down_and_forward(trajectory)
+    if np.linalg.norm(along) < 0.1:
+        return forward
+    along /= np.linalg.norm(along)
+    return along if along @ forward >= 0 else -along
+
+
+def _sample(cloud: Cloud) -> Array:
+    return cloud.points[:: max(1, len(cloud.points) // _SAMPLE)]
+
+
+def _local(cloud: Cloud, trajectory: Trajectory, world_from_cam: Array) -> Array:
+    """Return (N, 3) points of cloud and trajectory in camera axes, outliers clipped."""
+    points, centers = _sample(cloud), trajectory.world_from_cam[:, :3, 3]
+    local, path = points @ world_from_cam[:3, :3], centers @ world_from_cam[:3, :3]
+    if len(local):
+        low, high = np.percentile(local, [_OUTLIERS, 100 - _OUTLIERS], axis=0)
+        local = local[((local >= low) & (local <= high)).all(axis=1)]
+    return np.concatenate([local, path])
+
+
+def _extent(cloud: Cloud, trajectory: Trajectory, world_from_cam: Array) -> Array:
+    """Return (2, 3): lower and upper corner in camera axes."""
+    local = _local(cloud, trajectory, world_from_cam)
+    return np.stack([local.min(axis=0), local.max(axis=0)])
+
+
+def _fitting_center(local: Array, intrinsics: Array, size: tuple[int, int]) -> Array:
+    """Return the camera centre, in camera axes, nearest to the points that still sees them all.
+
+    For each side of the picture the camera must stay behind a plane; the two planes of an axis
+    meet in the best place on it, and the axis that needs more distance decides.
+    """
+    center, behind = np.zeros(3), np.inf
+    for axis, pixels in ((0, size[1]), (1, size[0])):
+        slope = (1 - 2 * _MARGIN) * 0.5 * pixels / intrinsics[axis, axis]
+        left = float((local[:, axis] + slope * local[:, 2]).min())
+        right = float((local[:, axis] - slope * local[:, 2]).max())
+        center[axis] = (left + right) / 2
+        behind = min(behind, (left - right) / (2 * slope))
+    center[2] = behind
+    return center
+
+
+def _in_view(
+    points: Array, world_from_cam: Array, intrinsics: Array, size: tuple[int, int]
+) -> Array:
+    """Return the depths of the points inside the picture."""
+    local = (points - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]
+    z = local[:, 2]
+    inside = z > 0
+    for axis, pixels in ((0, size[1]), (1, size[0])):
+        inside &= np.abs(local[:, axis]) < z * 0.5 * pixels / intrinsics[axis, axis]
+    return np.asarray(z[inside])
