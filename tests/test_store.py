@@ -8,8 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from laser_slam.config import load_config
 from laser_slam.errors import RunFolderError
-from laser_slam.store import atomic_write, load_prediction, save_prediction
+from laser_slam.store import (
+    atomic_write,
+    link_latest,
+    load_prediction,
+    new_run_folder,
+    open_run_folder,
+    save_prediction,
+)
 from laser_slam.types import Image, Prediction, WindowStatus
 
 HEIGHT, WIDTH = 192, 640
@@ -161,3 +169,80 @@ def test_a_full_disk_is_one_line_that_says_what_to_do(
 def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match=r"No such file or directory; create its folder"):
         save_prediction(tmp_path / "nowhere" / "0.npz", a_prediction(1), a_street(1))
+
+
+CONFIG = load_config()
+SEQUENCE = {"name": "drive", "size": [192, 640], "intrinsics": None}
+
+
+def test_a_new_folder_is_no_resumption_and_the_second_time_is(tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "run"
+    assert not open_run_folder(folder, CONFIG, SEQUENCE)
+    assert (folder / "windows").is_dir()
+    assert load_config(file=folder / "config.yaml") == CONFIG
+    assert open_run_folder(folder, CONFIG, SEQUENCE)
+
+
+def test_resuming_removes_what_a_killed_run_left_half_written(tmp_path: Path) -> None:
+    open_run_folder(tmp_path, CONFIG, SEQUENCE)
+    half = tmp_path / "windows" / ".000003.77.partial.npz"
+    half.write_bytes(b"half")
+    open_run_folder(tmp_path, CONFIG, SEQUENCE)
+    assert not half.exists()
+
+
+def test_a_run_with_other_settings_is_refused_by_the_names_that_differ(tmp_path: Path) -> None:
+    open_run_folder(tmp_path, CONFIG, SEQUENCE)
+    other = load_config(assignments=["windows.size=30", "registration.scale=l1"])
+    with pytest.raises(RunFolderError) as error:
+        open_run_folder(tmp_path, other, SEQUENCE)
+    assert "windows.size (20, now 30)" in str(error.value)
+    assert "registration.scale (log_huber, now l1)" in str(error.value)
+    assert "overlap" not in str(error.value)
+
+
+def test_a_run_of_another_input_is_refused(tmp_path: Path) -> None:
+    open_run_folder(tmp_path, CONFIG, SEQUENCE)
+    with pytest.raises(RunFolderError, match=r"other input: name \(drive, now walk\)"):
+        open_run_folder(tmp_path, CONFIG, {**SEQUENCE, "name": "walk"})
+
+
+def test_a_finished_run_is_never_written_over(tmp_path: Path) -> None:
+    open_run_folder(tmp_path, CONFIG, SEQUENCE)
+    (tmp_path / "report.json").write_text("{}")
+    with pytest.raises(RunFolderError, match="holds a finished run; choose another folder"):
+        open_run_folder(tmp_path, CONFIG, SEQUENCE)
+
+
+def test_a_folder_of_other_things_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("mine")
+    with pytest.raises(RunFolderError, match="neither empty nor a run folder"):
+        open_run_folder(tmp_path, CONFIG, SEQUENCE)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_a_file_where_the_folder_should_be_is_named(tmp_path: Path, inside: bool) -> None:
+    (tmp_path / "run").write_text("a file")
+    folder = tmp_path / "run" / "inner" if inside else tmp_path / "run"
+    with pytest.raises(RunFolderError, match="choose a"):
+        open_run_folder(folder, CONFIG, SEQUENCE)
+
+
+def test_a_broken_settings_file_in_the_run_folder_is_named(tmp_path: Path) -> None:
+    open_run_folder(tmp_path, CONFIG, SEQUENCE)
+    (tmp_path / "config.yaml").write_text("windows: [")
+    with pytest.raises(RunFolderError, match=r"cannot read .*config\.yaml"):
+        open_run_folder(tmp_path, CONFIG, SEQUENCE)
+
+
+def test_two_runs_in_one_second_get_two_folders(tmp_path: Path) -> None:
+    first = new_run_folder("drive", tmp_path)
+    first.mkdir()
+    second = new_run_folder("drive", tmp_path)
+    assert first != second
+    second.mkdir()
+    for folder in (first, second):
+        link_latest(folder)
+        assert (tmp_path / "latest").resolve() == folder.resolve()
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(["latest", first.name, second.name])

@@ -1,0 +1,221 @@
+"""The state machine: add windows one by one, know where every frame was."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.config import Config
+from laser_slam.errors import DegenerateGeometryError
+from laser_slam.registration import bridge, register
+from laser_slam.sim3 import Sim3, rotation_exp, rotation_log
+from laser_slam.types import Image, Prediction, Registration, Submap, Trajectory, WindowStatus
+
+Array = NDArray[np.float64]
+
+STEPS_OF_VELOCITY = 5  # a window's last steps are its least certain: average a few
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Node:
+    """A window's place in the world: what is kept of a submap once its depth is on disk.
+
+    Attributes:
+        index: of its window.
+        frames: (N,) rising indices in the sequence.
+        window_from_cam: (N, 4, 4) rigid, in window units.
+        world_from_window: Sim(3); world units are the units of the first window.
+        owned: first frame that this window owns, and the first that it no longer does.
+        registration: to the window before; None for the first.
+    """
+
+    index: int
+    frames: NDArray[np.int64]
+    window_from_cam: Array
+    world_from_window: Sim3
+    owned: tuple[int, int]
+    registration: Registration | None
+
+    @property
+    def is_owned(self) -> NDArray[np.bool_]:
+        """Return (N,) True where this window gives the frame to trajectory and map."""
+        return (self.frames >= self.owned[0]) & (self.frames < self.owned[1])
+
+    def submap(self, prediction: Prediction, colors: Image) -> Submap:
+        """Join the node with its window's prediction, read back from disk perhaps."""
+        if prediction.status is WindowStatus.FAILED:  # its own poses mean nothing
+            prediction = replace(prediction, window_from_cam=self.window_from_cam)
+        return Submap(
+            self.index,
+            prediction,
+            colors,
+            self.world_from_window,
+            self.is_owned,
+            self.registration,
+        )
+
+
+class Slam:
+    """Chain windows into one world; memory grows by a few kilobytes per window.
+
+    The world is the frame of the first window's first camera, in the first window's unit.
+
+    Attributes:
+        nodes: the places of all windows so far, in order.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._last: Prediction | None = None
+        self.nodes: list[Node] = []
+
+    def add(self, prediction: Prediction, colors: Image) -> Submap:
+        """Place the next window.
+
+        A window that cannot be registered is bridged: one warning, and ``bridged`` names it.
+
+        Args:
+            prediction: of the window that follows the last one added, sharing frames with it.
+            colors: (N, H, W, 3) RGB uint8, at the size of the depth maps.
+
+        Returns:
+            The submap, as far as is known now: the next window may yet take its last frames.
+        """
+        placed = _without_failure(prediction, self._last)
+        if self._last is None:
+            first_from_window = Sim3.from_matrix(placed.window_from_cam[0]).inverse()
+            self._append(placed, first_from_window, None)
+        else:
+            registration = self._register(self._last, placed)
+            self._split_shared_frames(placed)
+            world_from_previous = self.nodes[-1].world_from_window
+            self._append(
+                placed, world_from_previous @ registration.previous_from_current, registration
+            )
+        self._last = placed
+        return self.nodes[-1].submap(prediction, colors)
+
+    @property
+    def bridged(self) -> dict[int, str]:
+        """Name the windows whose place is a guess, and why."""
+        reasons = {node.index: node.registration for node in self.nodes}
+        return {index: r.bridged for index, r in reasons.items() if r is not None and r.bridged}
+
+    def trajectory(self, times_s: Array) -> Trajectory:
+        """Return the pose of every keyframe, each from the window that owns it.
+
+        Args:
+            times_s: seconds of the sequence's frames, by frame index.
+
+        Returns:
+            ``world_from_cam`` of the keyframes, in world units.
+        """
+        frames = [node.frames[node.is_owned] for node in self.nodes]
+        poses = [
+            node.world_from_window.apply_poses(node.window_from_cam[node.is_owned])
+            for node in self.nodes
+        ]
+        owned = np.concatenate(frames)
+        return Trajectory(owned, times_s[owned], np.concatenate(poses))
+
+    def _append(
+        self, placed: Prediction, world_from_window: Sim3, registration: Registration | None
+    ) -> None:
+        start = self.nodes[-1].owned[1] if self.nodes else int(placed.frames[0])
+        end = int(placed.frames[-1]) + 1
+        self.nodes.append(
+            Node(
+                len(self.nodes),
+                placed.frames,
+                placed.window_from_cam,
+                world_from_window,
+                (start, max(start, end)),
+                registration,
+            )
+        )
+
+    def _split_shared_frames(self, placed: Prediction) -> None:
+        """Give the first half of the shared frames to the last window, the rest to the new one.
+
+        Window ends are the least certain, so the middle of the overlap is the best border.
+        """
+        last = self.nodes[-1]
+        shared = np.intersect1d(last.frames, placed.frames)
+        border = int(shared[len(shared) // 2]) if len(shared) else int(placed.frames[0])
+        self.nodes[-1] = replace(last, owned=(last.owned[0], max(last.owned[0], border)))
+
+    def _register(self, last: Prediction, placed: Prediction) -> Registration:
+        reason = _unregistrable(last, placed)
+        if reason is None:
+            try:
+                return register(last, placed, self._config.registration)
+            except DegenerateGeometryError as error:
+                reason = str(error)
+        logger.warning("window %d is bridged: %s", len(self.nodes), reason)
+        return bridge(last, placed, reason)
+
+
+_STATUS_IN_WORDS = {
+    WindowStatus.STATIC: "the camera stands still",
+    WindowStatus.ROTATION: "the camera only turns",
+    WindowStatus.FAILED: "too little can be seen",
+}
+
+
+def _unregistrable(last: Prediction, placed: Prediction) -> str | None:
+    if placed.status is not WindowStatus.OK:
+        return _STATUS_IN_WORDS[placed.status]
+    if last.status is not WindowStatus.OK:
+        return f"no depth in the window before, where {_STATUS_IN_WORDS[last.status]}"
+    return None
+
+
+def _without_failure(prediction: Prediction, last: Prediction | None) -> Prediction:
+    """Replace the poses of a failed window by a continuation of the last window's motion."""
+    if prediction.status is not WindowStatus.FAILED:
+        return prediction
+    if last is None:
+        standing = np.tile(np.eye(4), (len(prediction.frames), 1, 1))
+        return replace(prediction, window_from_cam=standing)
+    return replace(prediction, window_from_cam=_continue_motion(last, prediction.frames))
+
+
+def _continue_motion(last: Prediction, frames: NDArray[np.int64]) -> Array:
+    """Extend the last window's poses at constant velocity, in its frame and unit.
+
+    Args:
+        last: the window whose motion goes on.
+        frames: (N,) rising indices; those that ``last`` has keep their pose.
+
+    Returns:
+        (N, 4, 4) rigid ``last_window_from_cam``.
+    """
+    turn, move = _velocity(last)
+    known = dict(zip(last.frames.tolist(), last.window_from_cam, strict=True))
+    frame, pose = max(known.items())
+    poses = []
+    for wanted in frames.tolist():
+        if wanted in known:
+            poses.append(known[wanted])
+            continue
+        step = np.eye(4)
+        step[:3, :3] = rotation_exp((wanted - frame) * turn)
+        step[:3, 3] = (wanted - frame) * move
+        frame, pose = wanted, pose @ step
+        poses.append(pose)
+    return np.stack(poses)
+
+
+def _velocity(last: Prediction) -> tuple[Array, Array]:
+    """Return rotation vector and translation per frame, in camera axes, at a window's end."""
+    poses = last.window_from_cam[-STEPS_OF_VELOCITY - 1 :]
+    gaps = np.diff(last.frames[-STEPS_OF_VELOCITY - 1 :])[:, None]
+    if not len(gaps):
+        return np.zeros(3), np.zeros(3)
+    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
+    turn = rotation_log(steps[:, :3, :3]) / gaps
+    return turn.mean(axis=0), (steps[:, :3, 3] / gaps).mean(axis=0)
