@@ -19,6 +19,13 @@ class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+class DatasetConfig(_Section):
+    """The input, where the material itself does not say."""
+
+    fps: float = Field(10.0, gt=0, description="frames per second of images without times")
+    stride: int = Field(1, ge=1, description="every so many-th frame of a video is read")
+
+
 class WindowsConfig(_Section):
     """Keyframes and overlapping windows."""
 
@@ -29,6 +36,9 @@ class WindowsConfig(_Section):
     )
     max_flow_px: float = Field(
         40.0, gt=0, description="motion with rotation that makes a keyframe anyway; px at 640 wide"
+    )
+    assumed_focal: float = Field(
+        0.6, gt=0, description="focal length where it is unknown, in image widths; for parallax only"
     )
 
     @model_validator(mode="after")
@@ -70,8 +80,13 @@ class RegistrationConfig(_Section):
     rigid: Literal["anchors", "points"] = Field(
         "anchors", description="what gives rotation and translation; points: 'w/o Anchor'"
     )
-    anchor_length: Literal["spread", "unit"] = Field(
-        "spread", description="length of the anchors' axes: spread of the centres, or the paper's 1"
+    huber_delta: float = Field(
+        0.1, gt=0, description="where 'huber' bends, in median ranges of the shared pixels"
+    )
+    anchor_length: Literal["balanced", "spread", "unit"] = Field(
+        "balanced",
+        description="length of the anchors' axes: noise of the centres over noise of the axes, "
+        "spread of the centres, or the paper's 1",
     )
     min_pixels: int = Field(100, ge=10, description="confident pixels that the scale needs")
 
@@ -108,6 +123,7 @@ class RunConfig(_Section):
 class Config(_Section):
     """All settings of a run."""
 
+    dataset: DatasetConfig = DatasetConfig()
     windows: WindowsConfig = WindowsConfig()
     backbone: BackboneConfig = BackboneConfig()
     registration: RegistrationConfig = RegistrationConfig()
