@@ -119,13 +119,16 @@ def rotation_exp(vector: Array) -> Array:
     return np.asarray(flat.reshape(*vector.shape[:-1], 3, 3))
 
 
-def umeyama(source: Array, target: Array, *, with_scale: bool = True) -> Sim3:
+def umeyama(
+    source: Array, target: Array, *, with_scale: bool = True, weights: Array | None = None
+) -> Sim3:
     """Fit the similarity that maps ``source`` on ``target`` in the least-squares sense.
 
     Args:
         source: (N, 3) points.
         target: (N, 3) the same points in the other frame.
         with_scale: False fits a rigid motion (scale 1): the Kabsch algorithm.
+        weights: (N,) >= 0, of each point's squared error; None: all alike.
 
     Returns:
         ``target_from_source``.
@@ -137,12 +140,15 @@ def umeyama(source: Array, target: Array, *, with_scale: bool = True) -> Sim3:
     """
     if len(source) < 3:
         raise DegenerateGeometryError(f"an alignment needs 3 points, got {len(source)}")
-    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    share = np.ones(len(source)) if weights is None else weights
+    share = share / share.sum()
+    source_mean, target_mean = share @ source, share @ target
     source_c, target_c = source - source_mean, target - target_mean
-    spread = float((source_c**2).sum())
-    if not np.isfinite(spread) or spread <= 0:
+    spread = float((share @ source_c**2).sum())
+    rounding = (1e-12 * float(np.abs(source).max())) ** 2
+    if not np.isfinite(spread) or spread <= rounding:
         raise DegenerateGeometryError("an alignment needs points in more than one place")
-    u, singular, vt = np.linalg.svd(target_c.T @ source_c)
+    u, singular, vt = np.linalg.svd(target_c.T @ (share[:, None] * source_c))
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     rotation = (u * sign) @ vt
     scale = float((singular * sign).sum() / spread) if with_scale else 1.0
