@@ -106,10 +106,10 @@ class FusionConfig(_Section):
         0.0, ge=0, description="edge of the averaging voxels in world units; 0: auto_voxel decides"
     )
     auto_voxel: float = Field(
-        0.005, gt=0, description="edge of the voxels, in median depths of the first good window"
+        0.008, gt=0, description="edge of the voxels, in median depths of the first good window"
     )
     min_observations: int = Field(
-        3, ge=1, description="frames that must see a voxel or its 26 neighbours; fewer: noise"
+        5, ge=1, description="views that a voxel and its 26 neighbours need in sum; fewer: noise"
     )
 
 

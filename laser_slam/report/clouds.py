@@ -16,8 +16,6 @@ from laser_slam.report.style import ACCENT, INK, MUTED, mark_ends, picture, roun
 from laser_slam.report.viewpoints import from_above, from_bird, from_driver
 from laser_slam.types import Cloud, Image, Trajectory
 
-_TOP_SKY, _LOW_SKY = (166, 197, 226), (247, 249, 251)
-
 
 class CloudView(StrEnum):
     """From where a cloud is seen."""
@@ -31,6 +29,11 @@ _PLACES = {
     CloudView.ABOVE: from_above,
     CloudView.BIRD: from_bird,
     CloudView.DRIVER: from_driver,
+}
+_SKIES = {  # top and bottom of the background
+    CloudView.ABOVE: ((255, 255, 255), (255, 255, 255)),
+    CloudView.BIRD: ((226, 233, 240), (255, 255, 255)),
+    CloudView.DRIVER: ((158, 192, 224), (247, 249, 251)),
 }
 
 
@@ -50,7 +53,7 @@ def cloud_picture(
         RunFolderError: the picture cannot be written.
     """
     viewpoint = _PLACES[view](cloud, trajectory)
-    image, _ = render_points(_with_size(cloud), viewpoint, _background(viewpoint))
+    image, _ = render_points(_with_size(cloud), viewpoint, _background(view, viewpoint.size))
     height, width = viewpoint.size
     with picture(path, height, layout=None) as figure:
         axes = figure.add_axes((0, 0, 1, 1), frameon=False)
@@ -74,14 +77,13 @@ def _with_size(cloud: Cloud) -> Cloud:
     return replace(cloud, voxel_size=float(np.median(distance[:, 1])))
 
 
-def _background(viewpoint: Viewpoint) -> Image:
-    """Return white paper for a plan, a pale sky for everything else."""
-    height, width = viewpoint.size
-    if viewpoint.parallel:
-        return np.full((height, width, 3), 255, np.uint8)
+def _background(view: CloudView, size: tuple[int, int]) -> Image:
+    """Return white paper for the plan, a hint of sky for the rest."""
+    height, width = size
+    top, bottom = np.array(_SKIES[view])
     share = np.linspace(0, 1, height)[:, None]
-    column = (1 - share) * np.array(_TOP_SKY) + share * np.array(_LOW_SKY)
-    return np.repeat(np.rint(column).astype(np.uint8)[:, None], width, axis=1)
+    column = np.rint((1 - share) * top + share * bottom).astype(np.uint8)
+    return np.repeat(column[:, None], width, axis=1)
 
 
 def _draw_path(axes: Axes, trajectory: Trajectory, viewpoint: Viewpoint) -> None:

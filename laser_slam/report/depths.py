@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from laser_slam.report.style import INK, WIDTH_PX, picture
 from laser_slam.types import Image
 
-_UNKNOWN = "#1d2126"
+_UNKNOWN = "#32373d"
 _GAP_PX = 10
 _HEAD_PX = 50
-_TITLES = ("image", "inverse depth (bright: near; dark grey: unknown)", "confidence (0 to 1)")
+_TITLES = ("image", "inverse depth (grey: unknown)", "confidence")
 
 
 def depth_picture(

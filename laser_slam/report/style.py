@@ -12,6 +12,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
 from laser_slam.store import atomic_write
@@ -63,6 +64,9 @@ def picture(path: Path, height_px: int, *, layout: str | None = "constrained") -
         options: Any = {"layout": layout}
         figure = Figure(figsize=(WIDTH_PX / DPI, height_px / DPI), dpi=DPI, **options)
         FigureCanvasAgg(figure)
+        engine = figure.get_layout_engine()
+        if isinstance(engine, ConstrainedLayoutEngine):
+            engine.set(w_pad=0.13, h_pad=0.13)  # inches
         yield figure
         with atomic_write(path) as partial:
             figure.savefig(partial, format="png", dpi=DPI)

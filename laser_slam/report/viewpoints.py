@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.camera import intrinsics_from_fov, intrinsics_matrix
+from laser_slam.camera import intrinsics_from_fov, intrinsics_matrix, project
 from laser_slam.report.splat import Viewpoint
 from laser_slam.types import Cloud, Trajectory
 
@@ -14,10 +14,13 @@ Array = NDArray[np.float64]
 _WIDTH_PX = 1200
 _SAMPLE = 200_000  # points that decide where a camera stands
 _MARGIN = 0.04  # of the picture, left free around the map
-_OUTLIERS = 0.4  # percent of the points, at each end of each axis, that need not be in the picture
+_OUTLIERS = 0.2  # percent of the points, at each end of each axis, that need not be in the picture
 _BIRD_TURN_DEG, _BIRD_DROP_DEG, _BIRD_FOV_DEG = 25.0, 38.0, 40.0
 _DRIVER_FOV_DEG = 75.0
-_DRIVER_BACK, _DRIVER_UP = 0.25, 0.08  # of the median depth in view
+_CELL_PX = 24
+_ONE_WAY = 0.6  # length of the mean viewing direction from which on cameras look one way
+_DOWN_PRIOR = 0.003  # weight of the mean y axis against the x axes, squared sines
+_DRIVER_BACK, _DRIVER_UP = 0.08, 0.03  # of the median depth in view
 
 
 def from_above(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
@@ -59,15 +62,15 @@ def from_bird(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
 
 
 def from_driver(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
-    """Look along the camera, from a little behind and above, where it sees most of the map."""
-    size = (675, _WIDTH_PX)
+    """Look along the camera, from a little behind and above, where the map fills the view most."""
+    size = (600, _WIDTH_PX)
     intrinsics = intrinsics_from_fov(_DRIVER_FOV_DEG, *size)
     points = _sample(cloud)
-    candidates = np.linspace(0, len(trajectory.frames) - 1, 12).astype(int)
+    candidates = np.unique(np.linspace(0, len(trajectory.frames) - 1, 16).astype(int))
     seen = [_in_view(points, trajectory.world_from_cam[i], intrinsics, size) for i in candidates]
-    best = int(np.argmax([len(depth) for depth in seen]))
+    best = int(np.argmax([covered for _, covered in seen]))
     world_from_cam = trajectory.world_from_cam[candidates[best]].copy()
-    depth = float(np.median(seen[best])) if len(seen[best]) else 1.0
+    depth = seen[best][0]
     back, up = _DRIVER_BACK * depth, _DRIVER_UP * depth
     world_from_cam[:3, 3] -= back * world_from_cam[:3, 2] + up * world_from_cam[:3, 1]
     return Viewpoint(world_from_cam, intrinsics, size, near=0.6 * back)
@@ -84,9 +87,15 @@ def _looking(look: Array, down: Array) -> Array:
 
 
 def _down_and_forward(trajectory: Trajectory) -> tuple[Array, Array]:
-    """Return unit vectors: the mean down of the cameras, and level forward of the first one."""
-    down = trajectory.world_from_cam[:, :3, 1].mean(axis=0)
-    if np.linalg.norm(down) < 0.1:  # upside down as often as upright
+    """Return unit vectors: down, and level forward of the first camera.
+
+    Cameras are seldom rolled but often pitched: down is square to their x axes, as far as these
+    tell, else their mean y.
+    """
+    x_axes = trajectory.world_from_cam[:, :3, 0]
+    mean_y = trajectory.world_from_cam[:, :3, 1].mean(axis=0)
+    down = np.linalg.solve(x_axes.T @ x_axes / len(x_axes) + _DOWN_PRIOR * np.eye(3), mean_y)
+    if np.linalg.norm(mean_y) < 0.1:  # upside down as often as upright
         down = trajectory.world_from_cam[0, :3, 1].copy()
     down /= np.linalg.norm(down)
     forward = trajectory.world_from_cam[0, :3, 2]
@@ -97,13 +106,21 @@ def _down_and_forward(trajectory: Trajectory) -> tuple[Array, Array]:
 
 
 def _main_direction(trajectory: Trajectory, cloud: Cloud, down: Array) -> Array:
-    """Return the level unit vector along which the map is longest, ahead of the first cameras."""
+    """Return the level unit vector along which to look.
+
+    Where most cameras looked one way, that way, because only these sides of things are known;
+    else along the longest axis of the map.
+    """
+    _, forward = _down_and_forward(trajectory)
+    mean_look = trajectory.world_from_cam[:, :3, 2].mean(axis=0)
+    mean_look = mean_look - (mean_look @ down) * down
+    if np.linalg.norm(mean_look) > _ONE_WAY:
+        return np.asarray(mean_look / np.linalg.norm(mean_look))
     points = np.concatenate([_sample(cloud)[::10], trajectory.world_from_cam[:, :3, 3]])
     level = points - np.outer(points @ down, down)
     level -= level.mean(axis=0)
     _, vectors = np.linalg.eigh(level.T @ level + 1e-12 * np.eye(3) - np.outer(down, down) * 1e-9)
     along = vectors[:, -1] - (vectors[:, -1] @ down) * down
-    _, forward = _down_and_forward(trajectory)
     if np.linalg.norm(along) < 0.1:
         return forward
     along /= np.linalg.norm(along)
@@ -149,11 +166,13 @@ def _fitting_center(local: Array, intrinsics: Array, size: tuple[int, int]) -> A
 
 def _in_view(
     points: Array, world_from_cam: Array, intrinsics: Array, size: tuple[int, int]
-) -> Array:
-    """Return the depths of the points inside the picture."""
-    local = (points - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]
-    z = local[:, 2]
-    inside = z > 0
-    for axis, pixels in ((0, size[1]), (1, size[0])):
-        inside &= np.abs(local[:, axis]) < z * 0.5 * pixels / intrinsics[axis, axis]
-    return np.asarray(z[inside])
+) -> tuple[float, int]:
+    """Return the median depth of the points in the picture and how many cells they cover."""
+    pixels = project((points - world_from_cam[:3, 3]) @ world_from_cam[:3, :3], intrinsics)
+    depth = (points - world_from_cam[:3, 3]) @ world_from_cam[:3, 2]
+    with np.errstate(invalid="ignore"):
+        inside = ((pixels >= 0) & (pixels < (size[1], size[0]))).all(axis=1)
+    if not inside.any():
+        return 1.0, 0
+    cells = (pixels[inside] // _CELL_PX).astype(np.int64)
+    return float(np.median(depth[inside])), len(np.unique(cells[:, 0] + cells[:, 1] * size[1]))
