@@ -113,6 +113,19 @@ class FusionConfig(_Section):
     )
 
 
+class SyntheticConfig(_Section):
+    """The generated drive."""
+
+    num_frames: int = Field(240, ge=2, description="frames")
+    step_m: float = Field(0.9, gt=0, le=5, description="mean distance between frames, metres")
+    width: int = Field(640, ge=64, le=4096, description="image width, px")
+    height: int = Field(192, ge=32, le=4096, description="image height, px")
+    focal: float = Field(0.58, ge=0.2, le=3, description="focal length, in image widths")
+    seed: int = Field(0, ge=0, description="of path, world and noise")
+    noise: float = Field(1.5, ge=0, le=50, description="sensor noise, grey levels of 255")
+    haze: float = Field(0.004, ge=0, le=0.1, description="light lost to the haze, per metre")
+
+
 class RunConfig(_Section):
     """The run itself."""
 
@@ -128,6 +141,7 @@ class Config(_Section):
     backbone: BackboneConfig = BackboneConfig()
     registration: RegistrationConfig = RegistrationConfig()
     fusion: FusionConfig = FusionConfig()
+    synthetic: SyntheticConfig = SyntheticConfig()
     run: RunConfig = RunConfig()
 
 
