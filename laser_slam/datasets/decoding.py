@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import struct
+import warnings
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias, TypeVar
@@ -28,6 +29,7 @@ MAX_UNREADABLE = 0.5  # share of the frames, beyond which a sequence is no input
 FLAGS = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION  # 8 bits, grey or colour, no alpha
 EXIF_IFD = 0x8769
 ORIENTATION_TAG = 0x0112
+NO_IMAGE = (OSError, SyntaxError, ValueError, PillowImage.DecompressionBombError)  # of Pillow
 
 
 @dataclass(frozen=True)
@@ -121,9 +123,9 @@ def orient(image: Image, orientation: int) -> Image:
 def read_header(path: Path) -> ImageHeader | None:
     """Read size and kind without decoding; None: no image that Pillow knows."""
     try:
-        with PillowImage.open(path) as image:
+        with _opened(path) as image:
             return ImageHeader(path.name, (image.height, image.width), image.mode)
-    except (OSError, SyntaxError, ValueError, PillowImage.DecompressionBombError):
+    except NO_IMAGE:
         return None
 
 
@@ -133,11 +135,20 @@ def read_exif(path: Path) -> dict[int, object]:
     A PNG is decoded for it: nothing to be done for every image.
     """
     try:
-        with PillowImage.open(path) as image:
+        with _opened(path) as image:
             exif = image.getexif()
             return {**exif, **exif.get_ifd(EXIF_IFD)}
-    except (OSError, SyntaxError, ValueError, PillowImage.DecompressionBombError):
+    except NO_IMAGE:
         return {}
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[PillowImage.Image]:
+    """Open without decoding, and keep Pillow's warnings about odd files from the terminal."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with PillowImage.open(path) as image:
+            yield image
 
 
 def orientation_of(exif: Mapping[int, object]) -> int:

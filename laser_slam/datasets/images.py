@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from laser_slam.config import DatasetConfig
 from laser_slam.datasets.decoding import (
     SUFFIXES,
+    Stream,
     check_same_kind,
     give_up_if_unreadable,
     orientation_of,
@@ -76,7 +76,7 @@ class ImageFolder:
         """Say what is known before the images are read."""
         return self._info
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Stream[Frame]:
         """Read the images in order, a few ahead; an unreadable one comes as None.
 
         Raises:

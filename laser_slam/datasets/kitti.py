@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from laser_slam.datasets.decoding import (
     SUFFIXES,
+    Stream,
     check_same_kind,
     give_up_if_unreadable,
     read_ahead,
@@ -64,7 +64,7 @@ class KittiOdometry:
         """Say what is known before the images are read."""
         return self._info
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Stream[Frame]:
         """Read the images in order, a few ahead; an unreadable one comes as None.
 
         Raises:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
 from contextlib import closing
 from itertools import repeat
 from pathlib import Path
@@ -65,7 +64,7 @@ class VideoFile:
         """Say what is known before the frames are read."""
         return self._info
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Stream[Frame]:
         """Read the frames in order, a few ahead; an undecodable one comes as None.
 
         Raises:
