@@ -38,7 +38,9 @@ class WindowsConfig(_Section):
         40.0, gt=0, description="motion with rotation that makes a keyframe anyway; px at 640 wide"
     )
     assumed_focal: float = Field(
-        0.6, gt=0, description="focal length where it is unknown, in image widths; for parallax only"
+        0.6,
+        gt=0,
+        description="focal length where it is unknown, in image widths; for parallax only",
     )
 
     @model_validator(mode="after")
@@ -96,7 +98,7 @@ class FusionConfig(_Section):
 
     min_confidence: float = Field(0.5, ge=0, le=1, description="pixels below it stay out")
     max_range: float = Field(
-        4.0, gt=0, description="depth beyond which pixels stay out, in median depths of the window"
+        3.0, gt=0, description="depth beyond which pixels stay out, in median depths of the window"
     )
     edge_jump: float = Field(
         0.05, gt=0, description="depth step between neighbours that makes an edge, in its depth"
@@ -106,7 +108,7 @@ class FusionConfig(_Section):
         0.0, ge=0, description="edge of the averaging voxels in world units; 0: auto_voxel decides"
     )
     auto_voxel: float = Field(
-        0.008, gt=0, description="edge of the voxels, in median depths of the first good window"
+        0.006, gt=0, description="edge of the voxels, in median depths of the first good window"
     )
     min_observations: int = Field(
         5, ge=1, description="views that a voxel and its 26 neighbours need in sum; fewer: noise"
@@ -129,8 +131,9 @@ class SyntheticConfig(_Section):
 class RunConfig(_Section):
     """The run itself."""
 
-    seed: int = Field(0, ge=0, description="of everything that draws random numbers")
-    workers: int = Field(0, ge=0, description="threads; 0: one per core")
+    samples: int = Field(
+        20, ge=1, description="keyframes whose depth is scored and drawn, spread over the run"
+    )
 
 
 class Config(_Section):

@@ -105,6 +105,11 @@ class Slam:
         reasons = {node.index: node.registration for node in self.nodes}
         return {index: r.bridged for index, r in reasons.items() if r is not None and r.bridged}
 
+    @property
+    def num_keyframes(self) -> int:
+        """Count the keyframes of all windows, each once."""
+        return sum(int(node.is_owned.sum()) for node in self.nodes)
+
     def trajectory(self, times_s: Array) -> Trajectory:
         """Return the pose of every keyframe, each from the window that owns it.
 

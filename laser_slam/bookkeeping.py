@@ -1,0 +1,134 @@
+"""What a run notes of itself: its frames, its warnings, its time by stage."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from laser_slam.errors import RunFolderError
+from laser_slam.types import Frame
+
+Item = TypeVar("Item")
+logger = logging.getLogger(__name__)
+
+
+class FrameLog:
+    """Remember of the frames that pass what the end of the run needs, and no image."""
+
+    def __init__(self) -> None:
+        self.times_s: list[float] = []
+        self.num_unreadable = 0
+
+    def note(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """Pass the frames on."""
+        for frame in frames:
+            self.times_s.append(frame.time_s)
+            if frame.image is None:
+                self.num_unreadable += 1
+                logger.warning("frame %d cannot be read", frame.index)
+            yield frame
+
+    def counts(self) -> dict[str, int]:
+        """Return how many frames were read, and how many could not be."""
+        return {"read": len(self.times_s), "unreadable": self.num_unreadable}
+
+
+class StageClock:
+    """Charge wall and CPU seconds to the innermost stage that is under way."""
+
+    def __init__(self) -> None:
+        self.wall_s: defaultdict[str, float] = defaultdict(float)
+        self.cpu_s: defaultdict[str, float] = defaultdict(float)
+        self._stages = ["other"]
+        self._mark = (time.perf_counter(), time.process_time())
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Charge what happens inside to ``name``, but for the stages inside it."""
+        self._charge()
+        self._stages.append(name)
+        try:
+            yield
+        finally:
+            self._charge()
+            self._stages.pop()
+
+    def timed(self, name: str, items: Iterable[Item]) -> Iterator[Item]:
+        """Charge the making of the items to ``name``, but not their use."""
+        iterator = iter(items)
+        while True:
+            with self.stage(name):
+                try:
+                    item = next(iterator)
+                except StopIteration:
+                    return
+            yield item
+
+    def report(self, num_frames: int) -> dict[str, Any]:
+        """Return seconds by stage, in all, and frames per second of wall time."""
+        self._charge()
+        total = sum(self.wall_s.values())
+        return {
+            "seconds": {
+                "wall": {stage: round(value, 3) for stage, value in self.wall_s.items()},
+                "cpu": {stage: round(value, 3) for stage, value in self.cpu_s.items()},
+                "wall_in_all": round(total, 3),
+                "cpu_in_all": round(sum(self.cpu_s.values()), 3),
+            },
+            "frames_per_second": round(num_frames / total, 3),
+        }
+
+    def _charge(self) -> None:
+        wall, cpu = time.perf_counter(), time.process_time()
+        self.wall_s[self._stages[-1]] += wall - self._mark[0]
+        self.cpu_s[self._stages[-1]] += cpu - self._mark[1]
+        self._mark = (wall, cpu)
+
+
+class _LogFile(logging.FileHandler):
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
+        """Stay silent on a full disk: the results' files tell, and the log is no reason to stop."""
+
+
+class _WarningList(logging.Handler):
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.messages: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.messages.append(record.getMessage())
+
+
+@contextmanager
+def run_log(path: Path) -> Iterator[list[str]]:
+    """Write what laser-slam logs to a file too, after what earlier attempts at the run wrote.
+
+    Yields:
+        The warnings so far.
+
+    Raises:
+        RunFolderError: the file cannot be opened.
+    """
+    try:
+        file = _LogFile(path, encoding="utf-8")
+    except OSError as error:
+        raise RunFolderError(f"cannot write {path}: {error.strerror}") from error
+    file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    warnings = _WarningList()
+    package = logging.getLogger("laser_slam")
+    level = package.level
+    package.setLevel(min(level or logging.INFO, logging.INFO))
+    package.addHandler(file)
+    package.addHandler(warnings)
+    try:
+        yield warnings.messages
+    finally:
+        package.removeHandler(warnings)
+        package.removeHandler(file)
+        package.setLevel(level)
+        file.close()

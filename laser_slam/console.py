@@ -1,0 +1,131 @@
+"""What a person sees of a run: progress with rate and time left, warnings, a short summary."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    ProgressColumn,
+    SpinnerColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.progress import Progress as Bars
+from rich.table import Table
+from rich.text import Text
+
+from laser_slam.pipeline import Progress, no_progress
+from laser_slam.results import Results
+
+SECONDS_BETWEEN_LINES = 10.0
+logger = logging.getLogger(__name__)
+
+
+@contextmanager
+def progress_display(*, quiet: bool) -> Iterator[Progress]:
+    """Show a run on standard error: bars on a terminal, plain lines elsewhere.
+
+    Args:
+        quiet: only warnings.
+
+    Yields:
+        What a pipeline reports its progress to.
+    """
+    console = Console(stderr=True)
+    if not quiet and console.is_terminal:
+        bars = Bars(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            _RateColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=console,
+        )
+        with _logging_to(RichHandler(console=console, show_path=False), logging.INFO), bars:
+            yield _BarProgress(bars)
+    else:
+        lines = logging.StreamHandler(console.file)
+        lines.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+        with _logging_to(lines, logging.WARNING if quiet else logging.INFO):
+            yield no_progress if quiet else _LineProgress()
+
+
+def print_summary(results: Results) -> None:
+    """Print the result in a few lines on standard output."""
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for name, value in summarize(results.report):
+        table.add_row(name, value)
+    table.add_row("results", f"{results.folder}  (map.ply, pictures, trajectories, report.json)")
+    Console(soft_wrap=True).print(table)
+
+
+def summarize(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Give the lines of the summary: a name and a value with its unit."""
+    frames, windows = report["frames"], report["windows"]
+    unreadable = f", {frames['unreadable']} unreadable" if frames["unreadable"] else ""
+    yield "frames", f"{frames['read']}{unreadable}, {frames['keyframes']} keyframes"
+    bridged = f", {len(windows['bridged'])} bridged" if windows["bridged"] else ""
+    yield "windows", f"{windows['num']}{bridged}"
+
+
+class _RateColumn(ProgressColumn):
+    def render(self, task: Task) -> Text:
+        """Show how many are done in a second."""
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{speed:.1f}/s")
+
+
+class _BarProgress:
+    """One bar a stage."""
+
+    def __init__(self, bars: Bars) -> None:
+        self._bars = bars
+        self._tasks: dict[str, Any] = {}
+
+    def __call__(self, stage: str, done: int, total: int | None) -> None:
+        if stage not in self._tasks:
+            self._tasks[stage] = self._bars.add_task(stage, total=total)
+        self._bars.update(self._tasks[stage], completed=done, total=total)
+
+
+class _LineProgress:
+    """A line every few seconds, and one at the end of a stage."""
+
+    def __init__(self) -> None:
+        self._stage = ""
+        self._start_s = self._last_s = 0.0
+
+    def __call__(self, stage: str, done: int, total: int | None) -> None:
+        now_s = time.monotonic()
+        if stage != self._stage:
+            self._stage, self._start_s, self._last_s = stage, now_s, now_s
+        if done == total or now_s - self._last_s >= SECONDS_BETWEEN_LINES:
+            self._last_s = now_s
+            of = "" if total is None else f" of {total}"
+            logger.info("%s: %d%s, %.0f s", stage, done, of, now_s - self._start_s)
+
+
+@contextmanager
+def _logging_to(handler: logging.Handler, level: int) -> Iterator[None]:
+    package = logging.getLogger("laser_slam")
+    before = package.level
+    handler.setLevel(level)
+    package.setLevel(logging.INFO)
+    package.addHandler(handler)
+    try:
+        yield
+    finally:
+        package.removeHandler(handler)
+        package.setLevel(before)

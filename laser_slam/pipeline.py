@@ -1,0 +1,261 @@
+"""A run: read, predict, register, store; then trajectory, map, scores, files."""
+
+from __future__ import annotations
+
+import logging
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.backbones import make_backbone
+from laser_slam.backbones.base import Backbone
+from laser_slam.bookkeeping import FrameLog, StageClock, run_log
+from laser_slam.camera import resize_intrinsics
+from laser_slam.config import Config
+from laser_slam.datasets.base import Dataset
+from laser_slam.errors import DatasetError, RunFolderError
+from laser_slam.evaluation.trajectory import evaluate_trajectory
+from laser_slam.export import write_ply
+from laser_slam.fusion import fuse
+from laser_slam.report import stages_picture
+from laser_slam.results import (
+    Results,
+    Scores,
+    describe_sequence,
+    draw_depth,
+    draw_map,
+    draw_trajectory,
+    peak_memory_mib,
+    sample_views,
+    score_depth,
+    versions,
+    write_report,
+    write_trajectories,
+)
+from laser_slam.sim3 import interpolate_poses
+from laser_slam.slam import Slam
+from laser_slam.store import (
+    link_latest,
+    load_prediction,
+    new_run_folder,
+    open_run_folder,
+    save_prediction,
+)
+from laser_slam.types import Cloud, Image, Prediction, Submap, Trajectory, Window
+from laser_slam.windows import cut_windows, select_keyframes
+
+Progress = Callable[[str, int, int | None], None]
+logger = logging.getLogger(__name__)
+
+
+def no_progress(stage: str, done: int, total: int | None) -> None:
+    """Show nothing."""
+
+
+class Pipeline:
+    """One run over a data set; everything that it leaves is in its folder.
+
+    Memory stays flat over the run: images and predictions pass through one window at a time.
+
+    Attributes:
+        folder: of the run.
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        config: Config,
+        out: Path | None = None,
+        *,
+        backbone: Backbone | None = None,
+        on_progress: Progress = no_progress,
+    ) -> None:
+        """Prepare a run; nothing is read or written yet.
+
+        Args:
+            dataset: the input.
+            config: all settings.
+            out: the run's folder, new or of a run that was broken off, which is then resumed;
+                None: ``runs/<sequence>-<time>``, with ``runs/latest`` linking to it.
+            backbone: the source of depth and poses; None: the one that the settings name.
+            on_progress: called with a stage's name, how much is done and of how much.
+        """
+        self._dataset = dataset
+        self._config = config
+        self._info = dataset.info
+        self._backbone = backbone or make_backbone(config.backbone)
+        self._on_progress = on_progress
+        self._slam = Slam(config)
+        self._input = FrameLog()
+        self._intrinsics: list[NDArray[np.float64]] = []
+        self._clock = StageClock()
+        self._is_named_here = out is None
+        self.folder = out or new_run_folder(self._info.name)
+
+    def run(self) -> Results:
+        """Map the sequence.
+
+        Raises:
+            LaserSlamError: the input, the settings or the folder cannot be used.
+        """
+        self._open_folder()
+        with run_log(self.folder / "run.log") as warnings:
+            for window in self._windows():
+                prediction, colors = self._predict(window)
+                self._place(prediction, colors)
+            trajectory = self._trajectory()
+            cloud = self._fuse()
+            with self._clock.stage("evaluate"):
+                scores = self._score(trajectory)
+            self._write(trajectory, cloud, scores)
+            report = self._report(cloud, scores, warnings)
+            write_report(self.folder / "report.json", report)
+        return Results(self.folder, trajectory, cloud, report)
+
+    def _open_folder(self) -> None:
+        sequence = _identify(self._dataset)
+        is_resumed = open_run_folder(self.folder, self._config, sequence)
+        if self._is_named_here:
+            link_latest(self.folder)
+        if is_resumed:
+            logger.info("resuming the run in %s", self.folder)
+
+    def _windows(self) -> Iterator[Window]:
+        """Read the frames, choose keyframes, cut windows: lazily, one window at a time."""
+        info, config, clock = self._info, self._config.windows, self._clock
+        frames = clock.timed("read", self._input.note(self._dataset.frames()))
+        keyframes = clock.timed(
+            "keyframes", select_keyframes(frames, config, info.intrinsics, info.size)
+        )
+        size = self._backbone.image_size(info.size)
+        return clock.timed("windows", cut_windows(keyframes, config, size))
+
+    def _predict(self, window: Window) -> tuple[Prediction, Image]:
+        """Ask the backbone, or read what it said of this window before the run was broken off."""
+        path = self._window_file(window.index)
+        if path.exists():
+            with self._clock.stage("load"):
+                prediction, colors = load_prediction(path)
+            if not np.array_equal(prediction.frames, window.frames):
+                raise RunFolderError(
+                    f"{path} holds other frames than window {window.index} of this input; "
+                    "choose another folder with --out"
+                )
+        else:
+            with self._clock.stage("predict"):
+                prediction = self._backbone.predict(
+                    window.images, window.frames, self._intrinsics_of(window)
+                )
+            with self._clock.stage("store"):
+                colors = _resize(window.images, prediction.depth.shape[1:])
+                prediction = save_prediction(path, prediction, colors)
+        for warning in prediction.warnings:
+            logger.warning("window %d: %s", window.index, warning)
+        return prediction, colors
+
+    def _intrinsics_of(self, window: Window) -> NDArray[np.float64] | None:
+        if self._info.intrinsics is None:
+            return None
+        height, width = window.images[0].shape[:2]
+        return resize_intrinsics(self._info.intrinsics, self._info.size, (height, width))
+
+    def _place(self, prediction: Prediction, colors: Image) -> None:
+        with self._clock.stage("register"):
+            self._slam.add(prediction, colors)
+        size = (prediction.depth.shape[1], prediction.depth.shape[2])
+        self._intrinsics.append(resize_intrinsics(prediction.intrinsics[0], size, self._info.size))
+        self._on_progress("mapping", len(self._input.times_s), self._info.num_frames)
+
+    def _trajectory(self) -> Trajectory:
+        """Give every frame of the input a pose, those between keyframes by interpolation."""
+        times_s = np.array(self._input.times_s)
+        with self._clock.stage("trajectory"):
+            key = self._slam.trajectory(times_s)
+            world_from_cam = interpolate_poses(times_s, key.times_s, key.world_from_cam)
+        return Trajectory(np.arange(len(times_s)), times_s, world_from_cam)
+
+    def _submaps(self) -> Iterator[Submap]:
+        """Read the stored windows back, one at a time, at their final places."""
+        nodes = self._slam.nodes
+        for node in nodes:
+            yield node.submap(*self._load(node.index))
+            self._on_progress("fusing", node.index + 1, len(nodes))
+
+    def _fuse(self) -> Cloud:
+        with self._clock.stage("fuse"):
+            return fuse(self._clock.timed("load", self._submaps()), self._config.fusion)
+
+    def _score(self, trajectory: Trajectory) -> Scores:
+        """Compare with the truth, as far as there is one."""
+        views = list(sample_views(self._slam.nodes, self._load, self._config.run.samples))
+        truth, errors = self._info.truth, None
+        if truth is not None:
+            errors = evaluate_trajectory(trajectory, truth)
+        depth = score_depth(
+            views,
+            self._dataset.true_depth,
+            errors.scale if errors else None,
+            self._config.fusion.min_confidence,
+        )
+        return Scores(errors, depth, views)
+
+    def _write(self, trajectory: Trajectory, cloud: Cloud, scores: Scores) -> None:
+        with self._clock.stage("write"):
+            write_trajectories(self.folder, trajectory, self._info.truth)
+            write_ply(self.folder / "map.ply", cloud)
+        with self._clock.stage("pictures"):
+            pictures = self.folder / "pictures"
+            draw_trajectory(pictures, trajectory, self._info.truth, scores.trajectory)
+            draw_map(pictures, trajectory, cloud)
+            draw_depth(pictures, scores.views)
+        stages_picture(pictures / "stages.png", dict(self._clock.wall_s))
+
+    def _report(self, cloud: Cloud, scores: Scores, warnings: list[str]) -> dict[str, Any]:
+        return {
+            "sequence": describe_sequence(self._info, self._intrinsics),
+            "frames": {**self._input.counts(), "keyframes": self._slam.num_keyframes},
+            "windows": {"num": len(self._slam.nodes), "bridged": self._slam.bridged},
+            "trajectory": scores.trajectory.numbers() if scores.trajectory else None,
+            "depth": scores.depth,
+            "map": {"num_points": len(cloud.points), "voxel_size": cloud.voxel_size},
+            "warnings": warnings,
+            **self._clock.report(len(self._input.times_s)),
+            "peak_memory_mib": peak_memory_mib(),
+            "versions": versions(),
+            "settings": self._config.model_dump(mode="json"),
+        }
+
+    def _load(self, index: int) -> tuple[Prediction, Image]:
+        return load_prediction(self._window_file(index))
+
+    def _window_file(self, index: int) -> Path:
+        return self.folder / "windows" / f"{index:06d}.npz"
+
+
+def _identify(dataset: Dataset) -> dict[str, Any]:
+    """Tell this input from others: what is known of it, and its first image's checksum."""
+    info = dataset.info
+    first = next(iter(dataset.frames()), None)
+    if first is None:
+        raise DatasetError(f"no frames in {info.name}")
+    image = b"" if first.image is None else first.image.tobytes()
+    return {
+        "name": info.name,
+        "size": list(info.size),
+        "num_frames": info.num_frames,
+        "intrinsics": None if info.intrinsics is None else info.intrinsics.tolist(),
+        "first_image_crc32": zlib.crc32(image),
+    }
+
+
+def _resize(images: tuple[Image, ...], size: tuple[int, ...]) -> Image:
+    """Reduce the images to (height, width) ``size`` of the depth maps."""
+    height, width = size
+    return np.stack(
+        [cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in images]
+    )
