@@ -6,11 +6,13 @@ from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 
+import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 from scipy.spatial import cKDTree
 
+from laser_slam.camera import resize_intrinsics
 from laser_slam.report.splat import Viewpoint, project_points, render_points
 from laser_slam.report.style import ACCENT, INK, MUTED, mark_ends, picture, round_length
 from laser_slam.report.viewpoints import from_above, from_bird, from_driver
@@ -30,6 +32,7 @@ _PLACES = {
     CloudView.BIRD: from_bird,
     CloudView.DRIVER: from_driver,
 }
+_SMOOTH = 2
 _SKIES = {  # top and bottom of the background
     CloudView.ABOVE: ((255, 255, 255), (255, 255, 255)),
     CloudView.BIRD: ((226, 233, 240), (255, 255, 255)),
@@ -53,7 +56,7 @@ def cloud_picture(
         RunFolderError: the picture cannot be written.
     """
     viewpoint = _PLACES[view](cloud, trajectory)
-    image, _ = render_points(_with_size(cloud), viewpoint, _background(view, viewpoint.size))
+    image = _render_smooth(_with_size(cloud), viewpoint, view)
     height, width = viewpoint.size
     with picture(path, height, layout=None) as figure:
         axes = figure.add_axes((0, 0, 1, 1), frameon=False)
@@ -75,6 +78,16 @@ def _with_size(cloud: Cloud) -> Cloud:
     queries = cloud.points[:: max(1, len(cloud.points) // 2000)]
     distance, _ = cKDTree(cloud.points).query(queries, k=2)
     return replace(cloud, voxel_size=float(np.median(distance[:, 1])))
+
+
+def _render_smooth(cloud: Cloud, viewpoint: Viewpoint, view: CloudView) -> Image:
+    """Render in twice the size and average, so that outlines have no steps."""
+    height, width = viewpoint.size
+    size = (_SMOOTH * height, _SMOOTH * width)
+    intrinsics = resize_intrinsics(viewpoint.intrinsics, viewpoint.size, size)
+    large = replace(viewpoint, intrinsics=intrinsics, size=size)
+    image, _ = render_points(cloud, large, _background(view, size))
+    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _background(view: CloudView, size: tuple[int, int]) -> Image:

@@ -13,10 +13,13 @@ from laser_slam.types import Cloud, Image
 
 Array = NDArray[np.float64]
 
-_MAX_RADIUS_PX = 6.0
+_MAX_RADIUS_PX = 12.0
 _SAME_SURFACE = 0.02  # of the depth: points this close behind the nearest one are mixed with it
 _HOLE_ROUNDS = 3
+_HOLE_NEIGHBOURS = 5  # of 8, for a pixel to be a hole and no background
 _SHADE_RADIUS_PX = 2
+_ROUGH = 2.0  # voxels
+_STEEP_PX = 300.0  # a step of a tenth of this is shaded fully in parallel projection
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,8 @@ def render_points(
     _draw_color(pixels, cloud.colors, (disc_px, viewpoint.parallel, *margin), depth, sums)
     for _ in range(_HOLE_ROUNDS):
         sums, depth = _fill_holes(sums, depth)
-    image = _compose(sums, depth, background, shade, viewpoint.parallel)
+    relief = focal / _STEEP_PX if viewpoint.parallel else 0.0
+    image = _compose(sums, depth, background, (shade, relief, _ROUGH * cloud.voxel_size))
     return image, np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
 
 
@@ -171,32 +175,39 @@ def _fill_holes(sums: Any, depth: Any) -> Any:
     new_sums, new_depth = sums.copy(), depth.copy()
     for v in range(1, height - 1):
         for u in range(1, width - 1):
-            if sums[v, u, 3] > 0:
-                continue
-            _fill_pixel(sums, depth, (v, u), new_sums, new_depth)
+            if sums[v, u, 3] == 0 and _count_neighbours(sums, v, u) >= _HOLE_NEIGHBOURS:
+                new_depth[v, u] = _mean_around(sums, depth, (v, u), new_sums[v, u])
     return new_sums, new_depth
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _fill_pixel(sums: Any, depth: Any, pixel: Any, new_sums: Any, new_depth: Any) -> None:
-    v, u = pixel
-    count, mean_depth = 0, 0.0
-    color = np.zeros(3, np.float32)
-    for dv in range(-1, 2):
-        for du in range(-1, 2):
-            total = sums[v + dv, u + du, 3]
-            if total > 0:
-                count += 1
-                mean_depth += depth[v + dv, u + du]
-                color += sums[v + dv, u + du, :3] / total
-    if count >= 5:
-        new_sums[v, u, :3] = color / count
-        new_sums[v, u, 3] = 1.0
-        new_depth[v, u] = mean_depth / count
+def _count_neighbours(sums: Any, v: int, u: int) -> int:
+    count = 0
+    for row in range(v - 1, v + 2):
+        for column in range(u - 1, u + 2):
+            count += sums[row, column, 3] > 0
+    return count
 
 
 @njit(cache=True, nogil=True)
-def _compose(sums: Any, depth: Any, background: Any, shade: float, parallel: bool) -> Any:
+def _mean_around(sums: Any, depth: Any, pixel: Any, mean: Any) -> Any:
+    """Add the colours of the neighbours to ``mean``; return their mean depth."""
+    v, u = pixel
+    total_depth = 0.0
+    for row in range(v - 1, v + 2):
+        for column in range(u - 1, u + 2):
+            weight = sums[row, column, 3]
+            if weight > 0:
+                for k in range(3):
+                    mean[k] += sums[row, column, k] / weight
+                mean[3] += 1
+                total_depth += depth[row, column]
+    return total_depth / mean[3]
+
+
+@njit(cache=True, nogil=True)
+def _compose(sums: Any, depth: Any, background: Any, light: Any) -> Any:
+    shade, relief, rough = light
     height, width = depth.shape
     image = background.copy()
     for v in range(height):
@@ -204,22 +215,26 @@ def _compose(sums: Any, depth: Any, background: Any, shade: float, parallel: boo
             total = sums[v, u, 3]
             if total <= 0:
                 continue
-            light = 1.0
-            if shade > 0 and not parallel:
-                light = np.exp(-shade * _occlusion(depth, v, u))
+            gain = np.exp(-shade * _occlusion(depth, (v, u), relief, rough)) / total
             for k in range(3):
-                image[v, u, k] = np.uint8(min(light * sums[v, u, k] / total + 0.5, 255.0))
+                image[v, u, k] = np.uint8(min(gain * sums[v, u, k] + 0.5, 255.0))
     return image
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _occlusion(depth: Any, v: int, u: int) -> float:
-    """Return how much nearer the surroundings are, in [0, 1] (eye-dome lighting)."""
+def _occlusion(depth: Any, pixel: Any, relief: float, rough: float) -> float:
+    """Return how much nearer the surroundings are, in [0, 1] (eye-dome lighting).
+
+    A step counts relative to the depth, or in parallel projection times ``relief``, as far as it
+    is larger than ``rough``: the discs themselves must not show.
+    """
+    v, u = pixel
+    scale = relief if relief > 0 else 1.0 / depth[v, u]
     total = 0.0
     for dv in range(-1, 2):
         for du in range(-1, 2):
             row, column = v + _SHADE_RADIUS_PX * dv, u + _SHADE_RADIUS_PX * du
             if 0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]:
-                step = 1.0 - depth[row, column] / depth[v, u]
-                total += min(max(step - 0.01, 0.0), 0.1) / 0.1
+                step = scale * (depth[v, u] - depth[row, column] - rough)
+                total += min(max(step, 0.0), 0.1) / 0.1
     return total / 8.0

@@ -12,15 +12,16 @@ from laser_slam.types import Cloud, Trajectory
 Array = NDArray[np.float64]
 
 _WIDTH_PX = 1200
+_LOWEST_PX = 480
 _SAMPLE = 200_000  # points that decide where a camera stands
 _MARGIN = 0.04  # of the picture, left free around the map
 _OUTLIERS = 0.2  # percent of the points, at each end of each axis, that need not be in the picture
 _BIRD_TURN_DEG, _BIRD_DROP_DEG, _BIRD_FOV_DEG = 25.0, 38.0, 40.0
-_DRIVER_FOV_DEG = 75.0
+_DRIVER_FOV_DEG = 64.0
 _CELL_PX = 24
 _ONE_WAY = 0.6  # length of the mean viewing direction from which on cameras look one way
 _DOWN_PRIOR = 0.003  # weight of the mean y axis against the x axes, squared sines
-_DRIVER_BACK, _DRIVER_UP = 0.08, 0.03  # of the median depth in view
+_DRIVER_BACK, _DRIVER_UP = 0.12, 0.04  # of the median depth in view
 
 
 def from_above(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
@@ -37,8 +38,9 @@ def from_above(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
         extent = _extent(cloud, trajectory, world_from_cam)
     low, high = extent
     span = np.maximum(high - low, 1e-9)
-    scale = (1 - 2 * _MARGIN) * _WIDTH_PX / max(span[0], 0.8 * span[1])
-    height = int(np.clip(scale * span[1] + 2 * _MARGIN * _WIDTH_PX, 500, 1200))
+    border = 2 * _MARGIN * _WIDTH_PX
+    scale = min((_WIDTH_PX - border) / span[0], (_WIDTH_PX - border) / span[1])
+    height = max(round(scale * span[1] + border), _LOWEST_PX)
     middle = (low + high) / 2
     world_from_cam[:3, 3] = world_from_cam[:3, :3] @ [middle[0], middle[1], low[2] - span[2]]
     intrinsics = intrinsics_matrix(scale, scale, (_WIDTH_PX - 1) / 2, (height - 1) / 2)
@@ -68,7 +70,7 @@ def from_driver(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
     points = _sample(cloud)
     candidates = np.unique(np.linspace(0, len(trajectory.frames) - 1, 16).astype(int))
     seen = [_in_view(points, trajectory.world_from_cam[i], intrinsics, size) for i in candidates]
-    best = int(np.argmax([covered for _, covered in seen]))
+    best = int(np.argmax([value for _, value in seen]))
     world_from_cam = trajectory.world_from_cam[candidates[best]].copy()
     depth = seen[best][0]
     back, up = _DRIVER_BACK * depth, _DRIVER_UP * depth
@@ -167,7 +169,10 @@ def _fitting_center(local: Array, intrinsics: Array, size: tuple[int, int]) -> A
 def _in_view(
     points: Array, world_from_cam: Array, intrinsics: Array, size: tuple[int, int]
 ) -> tuple[float, int]:
-    """Return the median depth of the points in the picture and how many cells they cover."""
+    """Return the median depth of the points in the picture, and how good the place is.
+
+    A good place shows much of the map (points) and little background (cells).
+    """
     pixels = project((points - world_from_cam[:3, 3]) @ world_from_cam[:3, :3], intrinsics)
     depth = (points - world_from_cam[:3, 3]) @ world_from_cam[:3, 2]
     with np.errstate(invalid="ignore"):
@@ -175,4 +180,6 @@ def _in_view(
     if not inside.any():
         return 1.0, 0
     cells = (pixels[inside] // _CELL_PX).astype(np.int64)
-    return float(np.median(depth[inside])), len(np.unique(cells[:, 0] + cells[:, 1] * size[1]))
+    return float(np.median(depth[inside])), len(cells) * len(
+        np.unique(cells[:, 0] + cells[:, 1] * size[1])
+    )
