@@ -69,11 +69,12 @@ def select_keyframes(
         if frame.image is None:
             continue
         grey = tracker.shrink(frame.image)
-        if _is_blank(grey):
+        corners = _corners(grey)
+        if len(corners) < MIN_CORNERS:
             continue
         motion = tracker.follow(grey)
         if motion.parallax >= config.min_parallax_px or motion.flow >= config.max_flow_px:
-            tracker.restart(grey)
+            tracker.restart(grey, corners)
             waiting = None
             yield frame
         else:
@@ -113,11 +114,6 @@ def cut_windows(
         yield _window(num_windows, recent)
 
 
-def _is_blank(grey: Grey) -> bool:
-    """Tell whether a small grey image (H, W) has too little texture to follow."""
-    return len(_corners(grey, MIN_CORNERS)) < MIN_CORNERS
-
-
 class _MotionTracker:
     """Follow the corners of the last keyframe from frame to frame, in small images."""
 
@@ -141,10 +137,10 @@ class _MotionTracker:
         size = (self._size[1], self._size[0])
         return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
 
-    def restart(self, grey: Grey) -> None:
-        """Make this image the one that motion is measured from."""
+    def restart(self, grey: Grey, corners: Points) -> None:
+        """Make this image, with its corners (N, 2), the one that motion is measured from."""
         self._previous = grey
-        self._start = self._points = _corners(grey, NUM_CORNERS)
+        self._start = self._points = corners
         self._num_start = len(self._start)
 
     def follow(self, grey: Grey) -> _Motion:
@@ -205,13 +201,13 @@ def _kabsch(source: Array, target: Array, weights: Array) -> Array:
     return orthonormal((target * weights[:, None]).T @ source)
 
 
-def _corners(grey: Grey, num: int) -> Points:
-    """Find up to ``num`` corners (N, 2), the strongest first, none weaker than the contrast."""
+def _corners(grey: Grey) -> Points:
+    """Find up to ``NUM_CORNERS`` corners (N, 2), none weaker than noise; few: a blank image."""
     strongest = float(cv2.cornerMinEigenVal(grey, 3).max())
     if strongest <= CORNER_CONTRAST:
         return np.zeros((0, 2), np.float32)
     quality = max(0.01, CORNER_CONTRAST / strongest)
-    found = cv2.goodFeaturesToTrack(grey, num, quality, MIN_DISTANCE_PX, blockSize=3)
+    found = cv2.goodFeaturesToTrack(grey, NUM_CORNERS, quality, MIN_DISTANCE_PX, blockSize=3)
     return np.asarray(found, np.float32).reshape(-1, 2)
 
 
