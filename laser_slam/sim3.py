@@ -32,7 +32,7 @@ class Sim3:
         translation: (3,) in units of the target.
 
     Raises:
-        DegenerateGeometryError: not finite, scale not positive, or rotation not orthonormal.
+        DegenerateGeometryError: not finite, scale not positive, or no rotation (skewed, mirrored).
 
     >>> b_from_a = Sim3(scale=2.0, translation=np.array([1.0, 0.0, 0.0]))
     >>> (b_from_a @ b_from_a.inverse()).scale
@@ -55,13 +55,16 @@ class Sim3:
             raise DegenerateGeometryError(
                 f"a Sim(3) needs finite numbers and a positive scale, got scale {self.scale}"
             )
-        if not np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-6):
-            raise DegenerateGeometryError("a Sim(3) needs an orthonormal rotation")
+        orthonormal_rows = np.allclose(self.rotation @ self.rotation.T, np.eye(3), atol=1e-6)
+        if not orthonormal_rows or np.linalg.det(self.rotation) < 0:
+            raise DegenerateGeometryError("a Sim(3) needs an orthonormal rotation, no mirror")
 
     @classmethod
     def from_matrix(cls, matrix: Array) -> Sim3:
         """Read a (4, 4) matrix ``[s R, t; 0, 1]``."""
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+        if not scale > 0:
+            raise DegenerateGeometryError(f"a Sim(3) needs a positive scale, got {scale}")
         return cls(scale, matrix[:3, :3] / scale, matrix[:3, 3])
 
     def matrix(self) -> Array:
@@ -134,7 +137,7 @@ def umeyama(
         ``target_from_source``.
 
     Raises:
-        DegenerateGeometryError: fewer than 3 points, or all source points in one place.
+        DegenerateGeometryError: fewer than 3 points, or all of them in one place.
 
     Reference: Umeyama, PAMI 1991.
     """
@@ -145,14 +148,20 @@ def umeyama(
     source_mean, target_mean = share @ source, share @ target
     source_c, target_c = source - source_mean, target - target_mean
     spread = float((share @ source_c**2).sum())
-    rounding = (1e-12 * float(np.abs(source).max())) ** 2
-    if not np.isfinite(spread) or spread <= rounding:
+    if not np.isfinite(spread) or spread <= _rounding(source):
         raise DegenerateGeometryError("an alignment needs points in more than one place")
+    if with_scale and float((share @ target_c**2).sum()) <= _rounding(target):
+        raise DegenerateGeometryError("a scale needs target points in more than one place")
     u, singular, vt = np.linalg.svd(target_c.T @ (share[:, None] * source_c))
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
     rotation = (u * sign) @ vt
     scale = float((singular * sign).sum() / spread) if with_scale else 1.0
     return Sim3(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+
+def _rounding(points: Array) -> float:
+    """Return the squared spread that mere rounding gives points in one place."""
+    return float((1e-12 * np.abs(points).max()) ** 2)
 
 
 def interpolate_poses(times_s: Array, key_times_s: Array, world_from_key: Array) -> Array:

@@ -43,10 +43,12 @@ class Trajectory:
     world_from_cam: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        """Refuse shapes that disagree and poses that are not finite."""
+        """Refuse shapes that disagree, frames that do not rise and poses that are not finite."""
         num = len(self.frames)
         if self.times_s.shape != (num,) or self.world_from_cam.shape != (num, 4, 4):
             raise ValueError(f"a trajectory of {num} frames needs as many times and 4x4 poses")
+        if not (np.diff(self.frames) > 0).all():
+            raise ValueError("frame indices must be rising")
         if not np.isfinite(self.world_from_cam).all():
             raise ValueError("a trajectory must be finite")
 
@@ -110,7 +112,8 @@ class Prediction:
         warnings: what a person should know of this window, one sentence each.
 
     Raises:
-        ValueError: shapes disagree, poses are not finite, depth is not positive.
+        ValueError: shapes disagree, frames do not rise, poses are not finite, confidence leaves
+            [0, 1], or depth has confidence but is not positive and finite.
     """
 
     frames: NDArray[np.int64]
@@ -132,10 +135,13 @@ class Prediction:
             raise ValueError("poses must be (N, 4, 4) and intrinsics (N, 3, 3)")
         if not (np.isfinite(self.window_from_cam).all() and np.isfinite(self.intrinsics).all()):
             raise ValueError("poses and intrinsics must be finite")
-        if not np.isfinite(self.confidence).all() or not np.all(
-            self.depth[self.confidence > 0] > 0
-        ):
-            raise ValueError("confidence must be finite, and depth positive where it is above 0")
+        if not (np.diff(self.frames) > 0).all():
+            raise ValueError("frame indices must be rising")
+        if not ((self.confidence >= 0) & (self.confidence <= 1)).all():
+            raise ValueError("confidence must be in [0, 1]")
+        seen = self.depth[self.confidence > 0]
+        if not ((seen > 0) & (seen < np.inf)).all():
+            raise ValueError("depth must be positive and finite where confidence is above 0")
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ def bridge(previous: Prediction, current: Prediction, reason: str) -> Registrati
 
 
 def _typical_depth(window: Prediction) -> float:
-    known = window.depth[(window.confidence > 0) & np.isfinite(window.depth)]
+    known = window.depth[window.confidence > 0]
     return float(np.median(known)) if len(known) else 1.0
 
 

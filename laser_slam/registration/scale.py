@@ -93,8 +93,8 @@ def _trusted(window: Prediction, index: int) -> NDArray[np.bool_]:
     Differs: the paper says above; stored confidences are quantised, and half of a map may
     share the highest value.
     """
-    confidence, depth = window.confidence[index], window.depth[index]
-    known: NDArray[np.bool_] = (confidence > 0) & np.isfinite(depth)
+    confidence = window.confidence[index]
+    known: NDArray[np.bool_] = confidence > 0
     values = confidence[known]
     if len(values) > 0:
         known &= confidence >= np.median(values[:: len(values) // _MAX_MEDIAN + 1])
