@@ -70,7 +70,7 @@ def drift_picture(path: Path, distance_m: Array, error_m: Array, *, unit: str = 
             _mark_rmse(axes, error_m, unit)
         axes.set(xlabel=f"distance travelled ({unit})", ylabel=f"position error ({unit})")
         axes.margins(x=0)
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.15 * axes.get_ylim()[1])  # room for the legend
 
 
 def stages_picture(path: Path, seconds_by_stage: Mapping[str, float]) -> None:

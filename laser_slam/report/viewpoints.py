@@ -17,11 +17,11 @@ _SAMPLE = 200_000  # points that decide where a camera stands
 _MARGIN = 0.04  # of the picture, left free around the map
 _OUTLIERS = 0.2  # percent of the points, at each end of each axis, that need not be in the picture
 _BIRD_TURN_DEG, _BIRD_DROP_DEG, _BIRD_FOV_DEG = 25.0, 38.0, 40.0
-_DRIVER_FOV_DEG = 64.0
+_DRIVER_FOV_DEG = 72.0
 _CELL_PX = 24
 _ONE_WAY = 0.6  # length of the mean viewing direction from which on cameras look one way
 _DOWN_PRIOR = 0.003  # weight of the mean y axis against the x axes, squared sines
-_DRIVER_BACK, _DRIVER_UP = 0.12, 0.04  # of the median depth in view
+_DRIVER_BACK, _DRIVER_UP = 0.15, 0.04  # of the median depth in view
 
 
 def from_above(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
