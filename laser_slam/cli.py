@@ -43,7 +43,7 @@ BackboneOption = Annotated[
 ]
 OutOption = Annotated[
     Path | None,
-    typer.Option("--out", help="Run folder, or a broken-off run to go on with.  [runs/NAME-TIME]"),
+    typer.Option("--out", help="Run folder, or a broken-off run to go on with."),
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", help="Only warnings and the result.")]
 IntrinsicsOption = Annotated[
@@ -198,6 +198,20 @@ def video(
 
 
 @command
+def eval(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Such as runs/latest.")],
+    truth: Annotated[
+        Path | None, typer.Option(help="Poses in metres: KITTI's format, or TUM's.")
+    ] = None,
+) -> None:
+    """Score a finished run again, perhaps against another truth."""
+    from laser_slam.console import print_summary
+    from laser_slam.rescoring import rescore
+
+    print_summary(rescore(run, truth), run)
+
+
+@command
 def config(config: ConfigOption = None, set: SetOption = None) -> None:
     """Print all settings, resolved."""
     from laser_slam.config import dump_config
@@ -243,7 +257,7 @@ def _map(dataset: Dataset, settings: Config, options: RunOptions) -> None:
         except KeyboardInterrupt as error:
             typer.echo(_how_to_go_on(pipeline), err=True)
             raise typer.Exit(INTERRUPTED) from error
-    print_summary(results)
+    print_summary(results.report, results.folder)
 
 
 def _how_to_go_on(pipeline: Pipeline) -> str:

@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -25,7 +26,6 @@ from rich.table import Table
 from rich.text import Text
 
 from laser_slam.pipeline import Progress, no_progress
-from laser_slam.results import Results
 
 SECONDS_BETWEEN_LINES = 10.0
 logger = logging.getLogger(__name__)
@@ -62,22 +62,43 @@ def progress_display(*, quiet: bool) -> Iterator[Progress]:
             yield no_progress if quiet else _LineProgress()
 
 
-def print_summary(results: Results) -> None:
+def print_summary(report: dict[str, Any], folder: Path) -> None:
     """Print the result in a few lines on standard output."""
     table = Table(show_header=False, box=None, pad_edge=False)
-    for name, value in summarize(results.report):
-        table.add_row(name, value)
-    table.add_row("results", f"{results.folder}  (map.ply, pictures, trajectories, report.json)")
+    for name, value in summarize(report):
+        table.add_row(name, Text(value))
+    table.add_row("map", Text(str(folder / "map.ply")))
+    table.add_row("pictures", Text(str(folder / "pictures")))
     Console(soft_wrap=True).print(table)
 
 
 def summarize(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Give the lines of the summary: a name and a value with its unit."""
+    """Give the lines of the summary: a name, and a value with its unit."""
     frames, windows = report["frames"], report["windows"]
     unreadable = f", {frames['unreadable']} unreadable" if frames["unreadable"] else ""
     yield "frames", f"{frames['read']}{unreadable}, {frames['keyframes']} keyframes"
     bridged = f", {len(windows['bridged'])} bridged" if windows["bridged"] else ""
     yield "windows", f"{windows['num']}{bridged}"
+    if report["trajectory"]:
+        yield from _summarize_trajectory(report["trajectory"])
+    if report["depth"]:
+        scores = report["depth"]["by_trajectory_scale"] or report["depth"]["by_median_ratio"]
+        if scores["abs_rel"] is not None:
+            share = f"over the {scores['coverage']:.0%} of pixels that are confident"
+            yield "depth AbsRel", f"{scores['abs_rel']:.3f} {share}"
+    yield "speed", f"{report['frames_per_second']:.1f} frames/s"
+
+
+def _summarize_trajectory(errors: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    if errors["reason"]:
+        yield "trajectory", f"not scored: {errors['reason']}"
+        return
+    rmse = errors["ate_sim3_m"]["rmse"]
+    yield "ATE (Sim(3))", f"{rmse:.3f} m RMSE over {errors['path_length_m']:.0f} m"
+    kitti = errors["kitti"]
+    if kitti["t_rel_percent"] is not None:
+        turn = f"{kitti['r_rel_deg_per_100m']:.2f} deg/100 m"
+        yield "t_rel, r_rel", f"{kitti['t_rel_percent']:.2f} %, {turn}"
 
 
 class _RateColumn(ProgressColumn):

@@ -93,6 +93,8 @@ def true_prediction(
         confidence[:, : SIZE[0] // 2] = 0.7
     else:
         window_from_cam[:, :3, 3] = 0
+        if status is not WindowStatus.ROTATION:
+            window_from_cam[:] = np.eye(4)
         depth = np.full((num, *SIZE), np.nan, np.float32)
         confidence = np.zeros(depth.shape, np.float32)
     return Prediction(frames, depth, confidence, window_from_cam, intrinsics, status)

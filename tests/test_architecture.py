@@ -9,7 +9,8 @@ PACKAGE = Path(__file__).parents[1] / "laser_slam"
 ROOTS = ["errors", "dependencies", "sim3", "camera", "types", "config", "store"]
 STAGES = ["datasets", "windows", "backbones", "registration", "fusion", "export", "evaluation"]
 STAGES += ["viewer", "report", "layers", "places", "pose_graph"]
-COMPOSITION = ["closures", "slam", "bookkeeping", "results", "pipeline", "console", "cli"]
+COMPOSITION = ["closures", "slam", "bookkeeping", "results", "rescoring", "pipeline"]
+COMPOSITION += ["console", "cli"]
 HEAVY = {"open3d", "torch", "gtsam", "numba", "cv2", "matplotlib", "scipy"}
 MODULES = sorted(PACKAGE.rglob("*.py"))
 

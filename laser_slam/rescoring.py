@@ -1,0 +1,120 @@
+"""Score a finished run again, perhaps against a truth that came later."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from laser_slam.errors import DatasetError, RunFolderError
+from laser_slam.evaluation.trajectory import evaluate_trajectory
+from laser_slam.results import draw_trajectory, write_report
+from laser_slam.types import Trajectory
+
+Array = NDArray[np.float64]
+
+
+def rescore(folder: Path, truth_file: Path | None = None) -> dict[str, Any]:
+    """Compare a run's trajectory with the truth; write the scores and pictures anew.
+
+    Args:
+        folder: of a finished run.
+        truth_file: poses in metres, KITTI's format (a line for every frame) or TUM's (by time);
+            None: the truth that the run itself had.
+
+    Returns:
+        The report, with the new scores in it.
+
+    Raises:
+        RunFolderError: no finished run is there, or it cannot be written.
+        DatasetError: there is no truth, it cannot be read or does not fit the run.
+    """
+    report = _read_report(folder / "report.json")
+    trajectory = read_trajectory(folder / "trajectory_tum.txt", None)
+    kept = folder / "truth_tum.txt"
+    if truth_file is None and not kept.exists():
+        raise DatasetError(f"the run in {folder} had no truth; pass a file of poses with --truth")
+    truth = read_trajectory(truth_file or kept, trajectory.times_s)
+    errors = evaluate_trajectory(trajectory, truth)
+    if errors.reason is not None:
+        raise DatasetError(f"{truth_file or kept} cannot score {folder}: {errors.reason}")
+    draw_trajectory(folder / "pictures", trajectory, truth, errors)
+    report["trajectory"] = errors.numbers()
+    write_report(folder / "report.json", report)
+    return report
+
+
+def read_trajectory(path: Path, times_s: Array | None) -> Trajectory:
+    """Read poses in KITTI's format (12 numbers a line) or TUM's (8).
+
+    Args:
+        path: of the file.
+        times_s: seconds of the sequence's frames, by which poses find their frame; None: the
+            file itself is in TUM's format and has a line for every frame.
+
+    Raises:
+        DatasetError: the file is missing, no table of poses, or of another length.
+    """
+    table = _read_table(path)
+    if table.shape[1] == 12:
+        if times_s is None or len(table) != len(times_s):
+            wanted = "times" if times_s is None else f"{len(times_s)} lines, one for every frame"
+            raise DatasetError(f"{path} has {len(table)} poses without time, need {wanted}")
+        world_from_cam = np.tile(np.eye(4), (len(table), 1, 1))
+        world_from_cam[:, :3] = table.reshape(-1, 3, 4)
+        return Trajectory(np.arange(len(table)), times_s, world_from_cam)
+    world_from_cam = np.tile(np.eye(4), (len(table), 1, 1))
+    world_from_cam[:, :3, :3] = Rotation.from_quat(table[:, 4:]).as_matrix()
+    world_from_cam[:, :3, 3] = table[:, 1:4]
+    if times_s is None:
+        return Trajectory(np.arange(len(table)), table[:, 0], world_from_cam)
+    return _at_frames(table[:, 0], world_from_cam, times_s)
+
+
+def _at_frames(pose_times_s: Array, world_from_cam: Array, times_s: Array) -> Trajectory:
+    """Give each frame the pose that is nearest in time, within half a frame."""
+    order = np.argsort(pose_times_s)
+    right = np.clip(np.searchsorted(pose_times_s[order], times_s), 1, len(order) - 1)
+    pair = np.stack([right - 1, right]) if len(order) > 1 else np.zeros((2, len(times_s)), int)
+    gaps = np.abs(pose_times_s[order][pair] - times_s)
+    nearest = order[np.take_along_axis(pair, gaps.argmin(axis=0)[None], axis=0)[0]]
+    reach = 0.5 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else np.inf
+    frames = np.flatnonzero(gaps.min(axis=0) <= reach)
+    return Trajectory(frames, times_s[frames], world_from_cam[nearest[frames]])
+
+
+def _read_table(path: Path) -> Array:
+    try:
+        with warnings.catch_warnings(action="ignore"):  # an empty file, said better below
+            table = np.loadtxt(path, ndmin=2)
+    except OSError as error:
+        raise DatasetError(f"cannot read poses {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise DatasetError(f"{path} is no table of poses: {error}") from error
+    if table.shape[1] not in (8, 12) or not len(table) or not np.isfinite(table).all():
+        raise DatasetError(
+            f"{path} has {table.shape[0]} lines of {table.shape[1]} numbers; "
+            "poses have 12 finite numbers a line (KITTI) or 8 (TUM)"
+        )
+    if table.shape[1] == 8 and not np.linalg.norm(table[:, 4:], axis=1).all():
+        raise DatasetError(f"{path} has a quaternion of zeros; TUM's lines are t x y z qx qy qz qw")
+    return np.asarray(table, np.float64)
+
+
+def _read_report(path: Path) -> dict[str, Any]:
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RunFolderError(
+            f"no finished run in {path.parent}; give a run folder, such as runs/latest"
+        ) from error
+    except ValueError as error:
+        raise RunFolderError(f"{path} is damaged: {error}") from error
+    if not isinstance(report, dict):
+        raise RunFolderError(f"{path} is no report of a run")
+    return report
