@@ -16,7 +16,7 @@ from laser_slam.errors import ConfigError
 class _Section(BaseModel):
     """A frozen group of settings that refuses unknown names."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class DatasetConfig(_Section):
@@ -61,6 +61,7 @@ class ClassicalConfig(_Section):
     track_patch: int = Field(7, ge=5, le=31, description="side of the tracked patch, px")
     num_features: int = Field(600, ge=100, description="corners per frame")
     max_backward_px: float = Field(0.7, gt=0, description="forward-backward gap of a good track")
+    refine_radius: int = Field(5, ge=2, le=10, description="half side of the patches that are aligned, px")
     context: int = Field(15, ge=0, description="earlier keyframes that steady a window's solution")
     depth_width: int = Field(640, ge=96, description="width of the depth maps, px")
     num_planes: int = Field(64, ge=16, le=256, description="inverse depths that are tried")
@@ -166,7 +167,7 @@ def load_config(
     """
     settings: dict[str, Any] = {}
     if name is not None:
-        _merge(settings, _read_yaml(shipped_configs() / f"{name}.yaml"))
+        _merge(settings, _read_shipped(name))
     if file is not None:
         _merge(settings, _read_yaml(file))
     for assignment in assignments:
@@ -203,11 +204,32 @@ def _validate(settings: dict[str, Any]) -> Config:
 
 def _explain(item: dict[str, Any]) -> str:
     name = ".".join(str(part) for part in item["loc"])
+    given = item["input"]
     if item["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(name, list(setting_names()), n=1)
-        return f"{name}: no such setting" + (f" (did you mean {near[0]}?)" if near else "")
+        return _explain_unknown(name, given)
+    if item["type"] == "model_type":
+        return f"{name}: a section needs settings below it, got {given!r}"[:300]
     text = str(item["msg"]).removeprefix("Value error, ")
-    return f"{name}: {text[0].lower()}{text[1:]}, got {item['input']!r}"[:300]
+    # A validator of ours has said what it got.
+    got = "" if item["type"] == "value_error" else f", got {given!r}"
+    return f"{name}: {text[0].lower()}{text[1:]}{got}"[:300]
+
+
+def _explain_unknown(name: str, given: Any) -> str:
+    while isinstance(given, dict) and len(given) > 0:
+        key, given = next(iter(given.items()))
+        name += f".{key}"
+    known = list(setting_names())
+    same_end = [other for other in known if other.endswith("." + name.rpartition(".")[2])]
+    near = difflib.get_close_matches(name, known, n=1) or same_end
+    return f"{name}: no such setting" + (f" (did you mean {near[0]}?)" if near else "")
+
+
+def _read_shipped(name: str) -> dict[str, Any]:
+    names = sorted(path.stem for path in shipped_configs().glob("*.yaml"))
+    if name not in names:
+        raise ConfigError(f"no settings named '{name}'; there are: {', '.join(names)}")
+    return _read_yaml(shipped_configs() / f"{name}.yaml")
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
@@ -226,7 +248,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 def _parse_assignment(assignment: str) -> dict[str, Any]:
     name, equals, value = assignment.partition("=")
-    if not equals:
+    if not equals or not all(name.strip().split(".")):
         raise ConfigError(f"--set wants section.key=value, got '{assignment}'")
     try:
         settings: Any = yaml.safe_load(value)
