@@ -27,7 +27,7 @@ def write_folder(folder: Path, num: int, suffix: str = ".png") -> Path:
 
 
 def write_video(path: Path, num: int = 12, size: tuple[int, int] = (48, 64)) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 20, size[::-1])
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20, size[::-1])
     for index in range(num):
         writer.write(np.full((*size, 3), 20 * index % 256, np.uint8))
     writer.release()

@@ -9,7 +9,7 @@ from image_files import HEIGHT, WIDTH, cut_file, textured, write_folder, write_p
 from PIL import Image as PillowImage
 from PIL import ImageOps
 
-from laser_slam.datasets.decoding import read_image
+from laser_slam.datasets.decoding import is_truncated, read_image
 from laser_slam.datasets.images import ImageFolder
 from laser_slam.errors import DatasetError
 
@@ -126,7 +126,9 @@ def test_a_thumbnail_does_not_hide_that_a_jpeg_is_truncated(tmp_path: Path) -> N
     segment = b"\xff\xe1" + (len(note) + 2).to_bytes(2, "big") + note
     path.write_bytes(data[:2] + segment + data[2:])
     assert read_image(path) is not None
+    assert not is_truncated(path.read_bytes())
     cut_file(path, 0.9)
+    assert is_truncated(path.read_bytes())
     assert read_image(path) is None
 
 

@@ -1,6 +1,8 @@
 """Videos are streamed with rising times; what is no video is refused."""
 
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -88,3 +90,18 @@ def test_files_that_are_no_video_are_refused(tmp_path: Path) -> None:
     write_video(tmp_path / "empty.avi", num=0)
     with pytest.raises(DatasetError, match=r"no frames can be read from .*empty.avi"):
         VideoFile(tmp_path / "empty.avi")
+
+
+def test_the_video_library_keeps_its_own_complaints_to_itself(tmp_path: Path) -> None:
+    """In a process of its own, for the library takes its log level once."""
+    (tmp_path / "text.mp4").write_text("this is a text\n" * 100)
+    script = (
+        "import pathlib, sys\n"
+        "from laser_slam.datasets.video import VideoFile\n"
+        "from laser_slam.errors import DatasetError\n"
+        "try:\n    VideoFile(pathlib.Path(sys.argv[1]))\n"
+        "except DatasetError:\n    pass\n"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path / "text.mp4")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stderr == ""

@@ -133,6 +133,23 @@ def test_a_cut_to_another_scene_makes_a_keyframe() -> None:
     assert chosen([sideways(0.0, seed) for seed in range(3)] + other) == [0, 3]
 
 
+def test_a_keyframe_that_is_mostly_covered_is_replaced() -> None:
+    """What is left of the first view does not move, but shows too little of it."""
+    covered = texture(7)
+    covered[:, WIDTH // 8 :] = texture(8)[:, WIDTH // 8 :]
+    images = [sideways(0.0, 0), sideways(0.0, 1), as_image(covered, 2), as_image(covered, 3)]
+    assert chosen(images) == [0, 2]
+
+
+def test_a_flickering_screen_makes_no_keyframes() -> None:
+    images = []
+    for step in range(6):
+        grey = texture(7)
+        grey[:, WIDTH // 2 :] = texture(10 + step)[:, WIDTH // 2 :]
+        images.append(as_image(grey, step))
+    assert chosen(images) == [0]
+
+
 def test_unreadable_and_blank_frames_are_never_keyframes() -> None:
     blank = as_image(np.full((HEIGHT, WIDTH), 90, np.float32))
     dark = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
@@ -234,11 +251,11 @@ def test_images_are_resized_to_what_the_backbone_wants(size: tuple[int, int]) ->
 
 
 def test_shrinking_averages_instead_of_picking_pixels() -> None:
-    stripes = np.zeros((4, 8, 3), np.uint8)
-    stripes[:, ::2] = 200
+    stripes = np.zeros((8, 16, 3), np.uint8)
+    stripes[:, ::4] = 200
     frames = [Frame(index, index, stripes) for index in range(3)]
     window = next(cut_windows(frames, WindowsConfig(size=3, overlap=1), (2, 4)))
-    assert np.all(window.images[0] == 100)
+    assert np.all(window.images[0] == 50)
 
 
 def test_too_few_keyframes_are_refused_with_advice() -> None:
