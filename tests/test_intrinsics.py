@@ -10,7 +10,6 @@ from PIL import Image as PillowImage
 
 from laser_slam.camera import intrinsics_matrix
 from laser_slam.datasets.images import ImageFolder
-from laser_slam.datasets.intrinsics import parse_intrinsics
 from laser_slam.errors import DatasetError
 
 
@@ -74,5 +73,3 @@ def test_impossible_intrinsics_are_refused(tmp_path: Path) -> None:
         ImageFolder(tmp_path, fov_deg=180)
     with pytest.raises(DatasetError, match="contradict"):
         ImageFolder(tmp_path, intrinsics=intrinsics_matrix(70, 70, 30, 20), fov_deg=60)
-    with pytest.raises(DatasetError, match=r"fx,fy,cx,cy in pixels.* got '1,2,3'"):
-        parse_intrinsics("1,2,3")

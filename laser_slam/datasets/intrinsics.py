@@ -25,24 +25,6 @@ PLAUSIBLE_FOCAL = (0.3, 10.0)  # in image diagonals; anything else in EXIF is a 
 UNKNOWN = "unknown: neither --intrinsics nor --fov given{exif}; the backbone has to estimate them"
 
 
-def parse_intrinsics(text: str) -> Array:
-    """Read ``fx,fy,cx,cy`` in pixels as a (3, 3) matrix.
-
-    Raises:
-        DatasetError: not four numbers.
-
-    >>> parse_intrinsics("700, 700, 320, 240")[0].tolist()
-    [700.0, 0.0, 320.0]
-    """
-    try:
-        fx, fy, cx, cy = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise DatasetError(
-            f"--intrinsics wants fx,fy,cx,cy in pixels, such as 720,720,640,360; got '{text}'"
-        ) from error
-    return intrinsics_matrix(fx, fy, cx, cy)
-
-
 def check_intrinsics(intrinsics: Array, size: tuple[int, int], source: str) -> Array:
     """Refuse intrinsics that no image of (height, width) ``size`` can have.
 
