@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -64,10 +65,12 @@ class RunOptions:
     out: OutOption = None
     quiet: QuietOption = False
 
-    def settings(self, name: str | None = None) -> Config:
-        """Resolve the settings, over those that ship as ``name``."""
-        backbone = [] if self.backbone is None else [f"backbone.name={self.backbone}"]
-        return _resolve(name, self.config, [*(self.set or []), *backbone])
+    def settings(self) -> Config:
+        """Resolve the settings."""
+        assignments = list(self.set or [])
+        if self.backbone is not None:
+            assignments.append(f"backbone.name={json.dumps(self.backbone)}")
+        return _resolve(self.config, assignments)
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
@@ -164,7 +167,7 @@ def kitti(
             "no KITTI folder; pass --root, or set LASER_SLAM_KITTI, to the folder that holds "
             "'sequences'"
         )
-    _map(KittiOdometry(root, sequence), options.settings("kitti"), options)
+    _map(KittiOdometry(root, sequence), options.settings(), options)
 
 
 @command
@@ -216,7 +219,7 @@ def config(config: ConfigOption = None, set: SetOption = None) -> None:
     """Print all settings, resolved."""
     from laser_slam.config import dump_config
 
-    typer.echo(dump_config(_resolve(None, config, set or [])), nl=False)
+    typer.echo(dump_config(_resolve(config, set or [])), nl=False)
 
 
 def main() -> None:
@@ -224,14 +227,14 @@ def main() -> None:
     app(prog_name="laser-slam")
 
 
-def _resolve(name: str | None, file: str | None, assignments: list[str]) -> Config:
+def _resolve(file: str | None, assignments: list[str]) -> Config:
     from laser_slam.config import load_config, shipped_configs
 
     path = None if file is None else Path(file)
     if path is not None and not path.exists():
         shipped = shipped_configs() / f"{file}.yaml"
         path = shipped if shipped.exists() else path
-    return load_config(name, path, assignments)
+    return load_config(None, path, assignments)
 
 
 def _parse_intrinsics(text: str | None) -> NDArray[np.float64] | None:
@@ -261,10 +264,14 @@ def _map(dataset: Dataset, settings: Config, options: RunOptions) -> None:
 
 
 def _how_to_go_on(pipeline: Pipeline) -> str:
-    kept = len(list((pipeline.folder / "windows").glob("*.npz")))
+    folder = pipeline.folder
+    kept = len(list((folder / "windows").glob("*.npz")))
     if kept == 0:
         return "laser-slam: interrupted; nothing is kept"
+    way = "goes on"
+    if pipeline.backbone.remembers:
+        way = f"starts again there, for {pipeline.backbone.name} needs the windows before"
     return (
-        f"laser-slam: interrupted; {kept} windows are kept in {pipeline.folder}; "
-        f"the same command with --out {pipeline.folder} goes on"
+        f"laser-slam: interrupted; {kept} windows are kept in {folder}; "
+        f"the same command with --out {folder} {way}"
     )

@@ -64,6 +64,7 @@ class Pipeline:
 
     Attributes:
         folder: of the run.
+        backbone: the source of depth and poses.
     """
 
     def __init__(
@@ -88,7 +89,7 @@ class Pipeline:
         self._dataset = dataset
         self._config = config
         self._info = dataset.info
-        self._backbone = backbone or make_backbone(config.backbone)
+        self.backbone = backbone or make_backbone(config.backbone)
         self._on_progress = on_progress
         self._slam = Slam(config)
         self._input = FrameLog()
@@ -132,13 +133,13 @@ class Pipeline:
         keyframes = clock.timed(
             "keyframes", select_keyframes(frames, config, info.intrinsics, info.size)
         )
-        size = self._backbone.image_size(info.size)
+        size = self.backbone.image_size(info.size)
         return clock.timed("windows", cut_windows(keyframes, config, size))
 
     def _predict(self, window: Window) -> tuple[Prediction, Image]:
         """Ask the backbone, or read what it said of this window before the run was broken off."""
         path = self._window_file(window.index)
-        if path.exists():
+        if path.exists() and not self.backbone.remembers:
             with self._clock.stage("load"):
                 prediction, colors = load_prediction(path)
             if not np.array_equal(prediction.frames, window.frames):
@@ -148,7 +149,7 @@ class Pipeline:
                 )
         else:
             with self._clock.stage("predict"):
-                prediction = self._backbone.predict(
+                prediction = self.backbone.predict(
                     window.images, window.frames, self._intrinsics_of(window)
                 )
             with self._clock.stage("store"):

@@ -108,6 +108,7 @@ class TrueBackbone:
     interrupt_at: int | None = None
     calls: int = 0
     name: str = "true"
+    remembers: bool = False
 
     def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
         return size
@@ -121,5 +122,6 @@ class TrueBackbone:
         call, self.calls = self.calls, self.calls + 1
         if call == self.interrupt_at:
             raise KeyboardInterrupt
-        unit_m = float(np.random.default_rng(int(frames[0])).uniform(0.5, 8.0))
+        seed = call if self.remembers else int(frames[0])
+        unit_m = float(np.random.default_rng(seed).uniform(0.5, 8.0))
         return true_prediction(frames, unit_m, self.statuses.get(call, WindowStatus.OK))

@@ -143,6 +143,17 @@ def test_a_broken_off_run_ends_as_one_that_was_not(tmp_path: Path, no_pictures: 
     assert outcome(tmp_path / "broken") == outcome(tmp_path / "whole")
 
 
+def test_a_backbone_that_remembers_is_asked_again_for_what_it_must_remember(
+    tmp_path: Path, no_pictures: None
+) -> None:
+    """Its predictions depend on the earlier ones: stored ones alone would break the chain."""
+    run(tmp_path / "whole", TrueBackbone(remembers=True))
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "broken", TrueBackbone(remembers=True, interrupt_at=3))
+    run(tmp_path / "broken", TrueBackbone(remembers=True))
+    assert outcome(tmp_path / "broken") == outcome(tmp_path / "whole")
+
+
 def test_resuming_with_other_settings_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, TrueBackbone(interrupt_at=1))

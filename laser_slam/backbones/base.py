@@ -19,6 +19,14 @@ class Backbone(Protocol):
         """Name it as the settings do."""
         ...
 
+    @property
+    def remembers(self) -> bool:
+        """Tell whether a prediction depends on the windows before it, as tracks do.
+
+        A resumed run then predicts the stored windows again, for it must end as a whole run does.
+        """
+        ...
+
     def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return the (height, width) at which it wants images of (height, width) ``size``."""
         ...
