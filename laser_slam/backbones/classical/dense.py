@@ -1,0 +1,109 @@
+"""Depth and confidence of all frames of a window, over threads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.backbones.classical.confidence import confidences
+from laser_slam.backbones.classical.sweep import (
+    Float,
+    Sweep,
+    View,
+    choose_neighbours,
+    make_view,
+    sweep,
+)
+from laser_slam.camera import resize_intrinsics
+from laser_slam.config import ClassicalConfig
+from laser_slam.sim3 import Array
+
+NEAR, FAR, FAR_MEDIANS = 0.6, 3.0, 20.0  # range of the planes around the sparse depths
+KNOWN_CONFIDENCE = 0.02  # below it, depth is unknown
+
+
+@dataclass(frozen=True)
+class PosedFrames:
+    """Frames with poses and the depths of their sparse points.
+
+    Attributes:
+        greys: C images (H, W) at full size.
+        rotations: (C, 3, 3) cam_from_window.
+        translations: (C, 3) cam_from_window.
+        sparse_depths: C arrays of depths of the points that a frame sees, window units.
+        intrinsics: (3, 3) in pixels of the images.
+    """
+
+    greys: Sequence[NDArray[np.uint8]]
+    rotations: Array
+    translations: Array
+    sparse_depths: Sequence[Array]
+    intrinsics: Array
+
+
+def depth_size(size: tuple[int, int], width: int) -> tuple[int, int]:
+    """Return the (height, width) of the depth maps of (height, width) images."""
+    factor = min(1.0, width / size[1])
+    return round(size[0] * factor), round(size[1] * factor)
+
+
+def dense_depth(
+    frames: PosedFrames, wanted: list[int], config: ClassicalConfig, workers: ThreadPoolExecutor
+) -> tuple[Float, Float, Array]:
+    """Compute the depth maps of some of the frames.
+
+    Args:
+        frames: the window and the frames around it, in order.
+        wanted: which frames to compute.
+        config: size and number of planes.
+        workers: threads to share the frames among.
+
+    Returns:
+        (N, H, W) depth in window units, NaN: unknown; (N, H, W) confidence in [0, 1]; (3, 3)
+        intrinsics of the depth maps.
+    """
+    full = frames.greys[0].shape
+    size = depth_size((full[0], full[1]), config.depth_width)
+    K = resize_intrinsics(frames.intrinsics, (full[0], full[1]), size)
+
+    def view(frame: int) -> View:
+        grey = cv2.resize(frames.greys[frame], size[::-1], interpolation=cv2.INTER_AREA)
+        return make_view(grey, frames.rotations[frame], frames.translations[frame])
+
+    views = list(workers.map(view, range(len(frames.greys))))
+
+    def depths(frame: int) -> Sweep | None:
+        known = frames.sparse_depths[frame]
+        if len(known) < 10:
+            return None
+        neighbours = choose_neighbours(views, frame, float(np.median(known)))
+        if not neighbours[0] and not neighbours[1]:
+            return None
+        return sweep(views, frame, neighbours, plane_range(known, config.num_planes), K)
+
+    sweeps: list[Sweep | None] = [None] * len(views)
+    for frame, result in zip(wanted, workers.map(depths, wanted), strict=True):
+        sweeps[frame] = result
+    depth = np.full((len(wanted), *size), np.nan, np.float32)
+    confidence = np.zeros((len(wanted), *size), np.float32)
+    swept = [frame for frame in wanted if sweeps[frame] is not None]
+    rated = workers.map(lambda frame: confidences(views, sweeps, [frame], K)[0], swept)
+    for frame, rating in zip(swept, rated, strict=True):
+        slot, result = wanted.index(frame), sweeps[frame]
+        if result is not None:
+            is_known = (rating > KNOWN_CONFIDENCE) & (result.inverse_depth > 0)
+            depth[slot][is_known] = 1.0 / result.inverse_depth[is_known]
+            confidence[slot][is_known] = rating[is_known]
+    return depth, confidence, K
+
+
+def plane_range(depths: Array, num: int) -> Float:
+    """Return (num,) inverse depths in equal steps from before the nearest to beyond the farthest."""
+    near = NEAR * float(np.percentile(depths, 1))
+    far = min(FAR * float(np.percentile(depths, 99)), FAR_MEDIANS * float(np.median(depths)))
+    return np.linspace(1.0 / near, 1.0 / max(far, 2 * near), num, dtype=np.float32)
