@@ -112,7 +112,7 @@ class FusionConfig(_Section):
         0.006, gt=0, description="edge of the voxels, in median depths of the first good window"
     )
     min_observations: int = Field(
-        5, ge=1, description="views that a voxel and its 26 neighbours need in sum; fewer: noise"
+        8, ge=1, description="views that a voxel and its 26 neighbours need in sum; fewer: noise"
     )
 
 

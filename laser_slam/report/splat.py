@@ -18,7 +18,7 @@ _SAME_SURFACE = 0.02  # of the depth: points this close behind the nearest one a
 _HOLE_ROUNDS = 3
 _HOLE_NEIGHBOURS = 5  # of 8, for a pixel to be a hole and no background
 _SHADE_RADIUS_PX = 2
-_ROUGH = 2.0  # voxels
+_ROUGH = 4.0  # voxels
 _STEEP_PX = 300.0  # a step of a tenth of this is shaded fully in parallel projection
 
 

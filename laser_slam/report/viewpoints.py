@@ -21,7 +21,7 @@ _DRIVER_FOV_DEG = 72.0
 _CELL_PX = 24
 _ONE_WAY = 0.6  # length of the mean viewing direction from which on cameras look one way
 _DOWN_PRIOR = 0.003  # weight of the mean y axis against the x axes, squared sines
-_DRIVER_BACK, _DRIVER_UP = 0.15, 0.04  # of the median depth in view
+_DRIVER_BACK, _DRIVER_UP, _DRIVER_NEAR = 0.12, 0.04, 0.15  # of the median depth in view
 
 
 def from_above(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
@@ -75,7 +75,7 @@ def from_driver(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
     depth = seen[best][0]
     back, up = _DRIVER_BACK * depth, _DRIVER_UP * depth
     world_from_cam[:3, 3] -= back * world_from_cam[:3, 2] + up * world_from_cam[:3, 1]
-    return Viewpoint(world_from_cam, intrinsics, size, near=0.6 * back)
+    return Viewpoint(world_from_cam, intrinsics, size, near=back + _DRIVER_NEAR * depth)
 
 
 def _looking(look: Array, down: Array) -> Array:
