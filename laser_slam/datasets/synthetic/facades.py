@@ -5,17 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from laser_slam.datasets.synthetic.hit import Hit, face_noise
 from laser_slam.datasets.synthetic.houses import BOARDS, BRICK, STONE, STOREY_M
+from laser_slam.datasets.synthetic.kernels import inlined, kernel
 from laser_slam.datasets.synthetic.textures import CLOUDS, GRAIN, band, hash01, pulse
 from laser_slam.datasets.synthetic.world import Scene
 
 PLINTH_M = 0.5
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def wall_color(scene: Scene, hit: Hit) -> Any:
     """Return (red, green, blue, gloss): the albedo of a wall, and how much glass it shows."""
     faces, face = scene.faces, hit.face
@@ -26,8 +26,8 @@ def wall_color(scene: Scene, hit: Hit) -> Any:
     tone += 0.10 * face_noise(scene.textures, CLOUDS, hit, 6.3, shift)
     tone *= 0.80 + 0.2 * min(max(hit.v / 1.2, 0.0), 1.0)  # splashes above the ground
     tone = max(tone, 0.1)
-    base = faces.color[face]
-    red, green, blue = base[0] * tone, base[1] * tone, base[2] * tone
+    red, green = faces.color[face, 0] * tone, faces.color[face, 1] * tone
+    blue = faces.color[face, 2] * tone
     if hit.v < PLINTH_M and faces.params[face, 3] > 0:
         grey = 0.5 * (red + green + blue) / 3 + 0.05 * tone
         red, green, blue = grey, grey, grey
@@ -37,11 +37,17 @@ def wall_color(scene: Scene, hit: Hit) -> Any:
     kind = int(faces.params[face, 2])
     cell = (column, row, fu, fv, seed, kind)
     if row == 0 and column == int(hash01(seed, 9, 9) * faces.size[face, 0] / 3.0):
-        return _door(hit, cell, (red, green, blue), faces.accent[face])
+        return _door(hit, cell, (red, green, blue), _accent(scene, face))
     return _window(scene, hit, cell, (red, green, blue))
 
 
-@njit(cache=True, nogil=True)
+@inlined
+def _accent(scene: Scene, face: int) -> Any:
+    accent = scene.faces.accent
+    return accent[face, 0], accent[face, 1], accent[face, 2]
+
+
+@inlined
 def _bay(hit: Hit, spacing: float, width: float) -> Any:
     """Return column, row and the metres from the column's middle and the storey's floor."""
     columns = max(int(width / spacing), 1)
@@ -53,7 +59,7 @@ def _bay(hit: Hit, spacing: float, width: float) -> Any:
     return column, row, hit.u - (column + 0.5) * pitch, hit.v - 0.2 - row * STOREY_M
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _masonry(hit: Hit, style: int, seed: int) -> Any:
     """Return the tone of the courses, about 1."""
     if style == BRICK:
@@ -67,7 +73,7 @@ def _masonry(hit: Hit, style: int, seed: int) -> Any:
     return 1.0 - 0.18 * pulse(hit.v - 0.1, STOREY_M, 0.09, hit.dv)  # plaster with string courses
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _courses(hit: Hit, length: float, height: float, contrast: float) -> Any:
     row = int(np.floor(hit.v / height))
     u = hit.u + 0.5 * length * (row & 1)
@@ -80,13 +86,13 @@ def _courses(hit: Hit, length: float, height: float, contrast: float) -> Any:
     return (1.0 + own + group) * (1 - 0.3 * joint) + 0.25 * joint
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _rectangle(fu: float, fv: float, edges: Any, hit: Hit) -> Any:
     left, right, low, high = edges
     return band(fu, left, right, hit.du) * band(fv, low, high, hit.dv)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _mix(color: Any, share: float, other: Any) -> Any:
     keep = 1.0 - share
     return (
@@ -96,7 +102,7 @@ def _mix(color: Any, share: float, other: Any) -> Any:
     )
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _door(hit: Hit, cell: Any, wall: Any, accent: Any) -> Any:
     _, _, fu, fv, seed, _ = cell
     frame = _rectangle(fu, fv, (-0.68, 0.68, -0.2, 2.35), hit)
@@ -113,7 +119,7 @@ def _door(hit: Hit, cell: Any, wall: Any, accent: Any) -> Any:
     return color[0], color[1], color[2], 0.5 * light
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _window(scene: Scene, hit: Hit, cell: Any, wall: Any) -> Any:
     column, row, fu, fv, seed, kind = cell
     if hash01(seed, column, 11) < 0.10:
@@ -123,7 +129,7 @@ def _window(scene: Scene, hit: Hit, cell: Any, wall: Any) -> Any:
     color = wall
     if kind == 1:  # shutters
         slats = 1.0 - 0.4 * pulse(fv, 0.09, 0.035, hit.dv)
-        accent = scene.faces.accent[hit.face]
+        accent = _accent(scene, hit.face)
         shutter = _rectangle(abs(fu), fv, (half + 0.08, half + 0.5, low, high), hit)
         color = _mix(
             color, shutter, (accent[0] * slats * 1.6, accent[1] * slats * 1.6, accent[2] * slats)
@@ -144,7 +150,7 @@ def _window(scene: Scene, hit: Hit, cell: Any, wall: Any) -> Any:
     return color[0], color[1], color[2], glass
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _panes(hit: Hit, fu: float, fv: float, opening: Any, kind: int) -> Any:
     half, low, high = opening
     bar = 0.06
@@ -156,7 +162,7 @@ def _panes(hit: Hit, fu: float, fv: float, opening: Any, kind: int) -> Any:
     return glass * (lower + upper)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _behind_glass(hit: Hit, cell: Any, fv: float, opening: Any) -> Any:
     """Return what is seen through a pane: a dark room, curtains, or a blind half down."""
     column, row, seed = cell
@@ -173,7 +179,7 @@ def _behind_glass(hit: Hit, cell: Any, fv: float, opening: Any) -> Any:
     return tone, tone * 1.1, tone * 1.25
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def roof_color(scene: Scene, hit: Hit) -> Any:
     """Return the albedo of a tiled roof."""
     faces, face = scene.faces, hit.face
@@ -186,6 +192,6 @@ def roof_color(scene: Scene, hit: Hit) -> Any:
     shift = hash01(faces.seed[face], 1, 23)
     tone += 0.13 * face_noise(scene.textures, CLOUDS, hit, 5.3, shift)
     tone += 0.09 * face_noise(scene.textures, GRAIN, hit, 2.1, shift)
-    base = faces.color[face]
     tone = max(tone, 0.15)
-    return base[0] * tone, base[1] * tone, base[2] * tone
+    color = faces.color
+    return color[face, 0] * tone, color[face, 1] * tone, color[face, 2] * tone

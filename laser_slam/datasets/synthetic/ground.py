@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from laser_slam.datasets.synthetic.hit import Hit, ground_noise
+from laser_slam.datasets.synthetic.kernels import inlined
 from laser_slam.datasets.synthetic.mesh import GROUND, KERB
 from laser_slam.datasets.synthetic.streets import HALF_ROAD_M, PAVEMENT_M, Streets, locate
 from laser_slam.datasets.synthetic.textures import CLOUDS, GRAIN, LEAVES, band, hash01, pulse
@@ -17,7 +17,7 @@ PARKING_M = 3.4  # the line between the lane and the parked cars
 SLAB_M = 0.6
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def ground_color(scene: Scene, hit: Hit, material: int) -> Any:
     """Return the albedo of ground, pavement or kerb."""
     lateral, along, sample, crossing = locate(scene.streets, hit.x, hit.z)
@@ -37,7 +37,7 @@ def ground_color(scene: Scene, hit: Hit, material: int) -> Any:
     return _grass(scene, hit, grain, coarse)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _footprint(streets: Streets, hit: Hit, sample: int) -> Any:
     """Return the pixel's extent across and along the street."""
     tx, tz = streets.tangents[sample, 0], streets.tangents[sample, 1]
@@ -49,7 +49,7 @@ def _footprint(streets: Streets, hit: Hit, sample: int) -> Any:
     )
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _asphalt(scene: Scene, hit: Hit, place: Any, grain: float, coarse: float) -> Any:
     lateral, along, crossing, dl, da = place
     middle = ground_noise(scene.textures, CLOUDS, hit, 5.1, 0.7)
@@ -69,7 +69,7 @@ def _asphalt(scene: Scene, hit: Hit, place: Any, grain: float, coarse: float) ->
     return tone, tone * 0.99, tone * (1.0 - 0.04 * (1 - paint))
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _patches(lateral: float, along: float, dl: float, da: float) -> Any:
     """Return the darkening by mended rectangles, drains and their seams."""
     block, lane = int(np.floor(along / 13.0)), int(np.floor(lateral / 2.75))
@@ -89,7 +89,7 @@ def _patches(lateral: float, along: float, dl: float, da: float) -> Any:
     return 1.0 - 0.55 * cover if kind < 0.75 else 1.0
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _slabs(lateral: float, along: float, width: Any, grain: float, coarse: float) -> Any:
     dl, da = width
     joint = pulse(along, SLAB_M, 0.018, da)
@@ -102,7 +102,7 @@ def _slabs(lateral: float, along: float, width: Any, grain: float, coarse: float
     return tone * 1.02, tone * 0.97, tone * 0.88
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _grass(scene: Scene, hit: Hit, grain: float, coarse: float) -> Any:
     blades = ground_noise(scene.textures, LEAVES, hit, 1.3, 0.1)
     tufts = ground_noise(scene.textures, LEAVES, hit, 7.9, 0.6)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from laser_slam.datasets.synthetic.kernels import inlined, kernel
 from laser_slam.datasets.synthetic.textures import Textures, noise
 from laser_slam.datasets.synthetic.world import Scene
 
@@ -53,7 +53,7 @@ class Hit(NamedTuple):
     depth: float
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def make_hit(scene: Scene, ray: Any, camera: Any, triangle: int, depth: float) -> Any:
     """Intersect the pixel's ray, and those of its neighbours, with the triangle's plane.
 
@@ -64,9 +64,10 @@ def make_hit(scene: Scene, ray: Any, camera: Any, triangle: int, depth: float) -
         triangle: that was hit.
         depth: along the ray, in lengths of its direction.
     """
-    n = scene.normals[triangle]
-    nx, ny, nz = float(n[0]), float(n[1]), float(n[2])
-    dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
+    nx = float(scene.normals[triangle, 0])
+    ny = float(scene.normals[triangle, 1])
+    nz = float(scene.normals[triangle, 2])
+    dx, dy, dz = ray[3], ray[4], ray[5]
     facing = nx * dx + ny * dy + nz * dz
     if facing > 0:
         nx, ny, nz, facing = -nx, -ny, -nz, -facing
@@ -83,21 +84,17 @@ def make_hit(scene: Scene, ray: Any, camera: Any, triangle: int, depth: float) -
     mx, my, mz = (ax / a, ay / a, az / a) if a > b else (bx / b, by / b, bz / b)
     x, y, z = ray[0] + depth * dx, ray[1] + depth * dy, ray[2] + depth * dz
     face = scene.triangle_face[triangle]
-    u_axis, v_axis = scene.faces.u_axis[face], scene.faces.v_axis[face]
-    origin = scene.faces.origin[face]
-    px, py, pz = x - origin[0], y - origin[1], z - origin[2]
-    u = px * u_axis[0] + py * u_axis[1] + pz * u_axis[2]
-    v = px * v_axis[0] + py * v_axis[1] + pz * v_axis[2]
-    du = abs(ax * u_axis[0] + ay * u_axis[1] + az * u_axis[2])
-    du += abs(bx * u_axis[0] + by * u_axis[1] + bz * u_axis[2])
-    dv = abs(ax * v_axis[0] + ay * v_axis[1] + az * v_axis[2])
-    dv += abs(bx * v_axis[0] + by * v_axis[1] + bz * v_axis[2])
-    return Hit(
-        face, x, y, z, nx, ny, nz, u, v, du, dv, min(a, b), max(a, b), mx, my, mz, depth
-    )
+    faces = scene.faces
+    ux, uy, uz = faces.u_axis[face, 0], faces.u_axis[face, 1], faces.u_axis[face, 2]
+    vx, vy, vz = faces.v_axis[face, 0], faces.v_axis[face, 1], faces.v_axis[face, 2]
+    px, py, pz = x - faces.origin[face, 0], y - faces.origin[face, 1], z - faces.origin[face, 2]
+    u, v = px * ux + py * uy + pz * uz, px * vx + py * vy + pz * vz
+    du = abs(ax * ux + ay * uy + az * uz) + abs(bx * ux + by * uy + bz * uz)
+    dv = abs(ax * vx + ay * vy + az * vz) + abs(bx * vx + by * vy + bz * vz)
+    return Hit(face, x, y, z, nx, ny, nz, u, v, du, dv, min(a, b), max(a, b), mx, my, mz, depth)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def ground_noise(textures: Textures, kind: int, hit: Hit, tile: float, shift: float) -> Any:
     """Sample noise on the ground plan, averaged along the footprint's longer side."""
     taps = 4 if hit.major > 2.5 * hit.minor else 1
@@ -115,7 +112,7 @@ def ground_noise(textures: Textures, kind: int, hit: Hit, tile: float, shift: fl
     return total / taps
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def face_noise(textures: Textures, kind: int, hit: Hit, tile: float, shift: float) -> Any:
     """Sample noise in the face's own (u, v) frame."""
     footprint = np.sqrt(max(hit.du, 1e-5) * max(hit.dv, 1e-5)) / tile
@@ -123,7 +120,7 @@ def face_noise(textures: Textures, kind: int, hit: Hit, tile: float, shift: floa
     return noise(textures, kind, hit.u / tile + shift, hit.v / tile + 1.7 * shift, footprint)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def solid_noise(textures: Textures, kind: int, hit: Hit, tile: float, shift: float) -> Any:
     """Sample noise on three planes and blend them by the normal: never stretched."""
     wx, wy, wz = hit.nx * hit.nx, hit.ny * hit.ny, hit.nz * hit.nz

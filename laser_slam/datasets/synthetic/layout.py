@@ -89,7 +89,9 @@ class Layout:
                 self._add_cars(rows, side, rng)
         self._add_background(rng)
 
-    def _place(self, sample: int, lateral: float, along: float = 0.0, turn: float = 0.0) -> Placement:
+    def _place(
+        self, sample: int, lateral: float, along: float = 0.0, turn: float = 0.0
+    ) -> Placement:
         """Stand ``lateral`` metres right of a centre line, facing it; ``turn`` in radians."""
         tangent = self._streets.tangents[sample]
         right = np.array([tangent[1], -tangent[0]])
@@ -99,9 +101,7 @@ class Layout:
         ground = float(self._terrain.at(spot[None])[0])
         return Placement(np.array([spot[0], ground, spot[1]]), yaw)
 
-    def _add_houses(
-        self, rows: NDArray[np.int64], side: float, rng: np.random.Generator
-    ) -> None:
+    def _add_houses(self, rows: NDArray[np.int64], side: float, rng: np.random.Generator) -> None:
         at = float(rng.uniform(0, 4))
         while at < len(rows) - 1:
             size = houses.draw_size(rng)
@@ -142,9 +142,7 @@ class Layout:
         if self._occupancy.take(place, (1.0, 1.0), EDGE_M):
             plants.add_shrub(self._builder, place, float(rng.uniform(0.4, 0.9)), rng)
 
-    def _add_roadside(
-        self, rows: NDArray[np.int64], side: float, rng: np.random.Generator
-    ) -> None:
+    def _add_roadside(self, rows: NDArray[np.int64], side: float, rng: np.random.Generator) -> None:
         """Add street trees, lamps, signs and bollards along the pavement."""
         avenue = rng.random() < 0.6
         at = float(rng.uniform(2, 8))
@@ -195,7 +193,10 @@ class Layout:
             place = self._place(end, 0.0, sign * (EDGE_M + 4.0), turn)
             width, depth = rng.uniform(14, 20), rng.uniform(8, 10)
             size = houses.HouseSize(
-                float(width), float(depth), int(rng.integers(2, 5)), str(rng.choice(["along", "hip"]))
+                float(width),
+                float(depth),
+                int(rng.integers(2, 5)),
+                str(rng.choice(["along", "hip"])),
             )
             if self._take_house(place, size):
                 houses.add_house(self._builder, place, size, rng)

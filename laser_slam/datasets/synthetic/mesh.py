@@ -12,7 +12,9 @@ Array = NDArray[np.float64]
 Color = tuple[float, float, float]
 
 # Materials
-GROUND, PAVEMENT, KERB, WALL, ROOF, LEAF, BARK, PLAIN, PAINT, CAR_SIDE, GLASS, TYRE, SIGN = range(13)
+GROUND, PAVEMENT, KERB, WALL, ROOF, LEAF, BARK, PLAIN, PAINT, CAR_SIDE, GLASS, TYRE, SIGN = range(
+    13
+)
 
 
 @dataclass(frozen=True)

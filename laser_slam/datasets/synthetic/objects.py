@@ -5,15 +5,20 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from laser_slam.datasets.synthetic.hit import Hit, solid_noise
-from laser_slam.datasets.synthetic.mesh import BARK, CAR_SIDE, GLASS, PLAIN, SIGN, TYRE
+from laser_slam.datasets.synthetic.kernels import inlined
+from laser_slam.datasets.synthetic.mesh import BARK, CAR_SIDE, GLASS, PLAIN, SIGN, TYRE, Faces
 from laser_slam.datasets.synthetic.textures import CLOUDS, GRAIN, LEAVES, band, hash01
 from laser_slam.datasets.synthetic.world import Scene
 
 
-@njit(cache=True, nogil=True)
+@inlined
+def _base(faces: Faces, face: int) -> Any:
+    return faces.color[face, 0], faces.color[face, 1], faces.color[face, 2]
+
+
+@inlined
 def leaf_color(scene: Scene, hit: Hit) -> Any:
     """Return the albedo of foliage: specks of leaves, clumps, darker inside and below."""
     faces, face = scene.faces, hit.face
@@ -26,12 +31,12 @@ def leaf_color(scene: Scene, hit: Hit) -> Any:
         height = (faces.origin[face, 1] - hit.y) / radius  # -1 below the crown, 1 on top
         tone *= min(max(0.80 + 0.22 * height, 0.45), 1.1)
     tone = max(tone, 0.14)
-    base = faces.color[face]
+    base = _base(faces, face)
     warm = 1.0 + 0.10 * clumps
     return base[0] * tone * warm, base[1] * tone, base[2] * tone
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def object_color(scene: Scene, hit: Hit, material: int) -> Any:
     """Return (red, green, blue, gloss) of bark, metal, cars and signs."""
     if material == SIGN:
@@ -42,7 +47,7 @@ def object_color(scene: Scene, hit: Hit, material: int) -> Any:
         return _tyre(hit, scene)
     if material == GLASS:
         return 0.015, 0.018, 0.02, 1.0
-    base = scene.faces.color[hit.face]
+    base = _base(scene.faces, hit.face)
     if material == BARK or material == PLAIN:
         tone = 1.0 + 0.12 * solid_noise(scene.textures, GRAIN, hit, 1.1, 0.2)
         tone += (0.2 if material == BARK else 0.05) * solid_noise(
@@ -53,11 +58,11 @@ def object_color(scene: Scene, hit: Hit, material: int) -> Any:
     return _car_end(scene, hit)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _car_end(scene: Scene, hit: Hit) -> Any:
     """Return paint, with lamps and a number plate at the front and the rear."""
     faces, face = scene.faces, hit.face
-    base = faces.color[face]
+    base = _base(faces, face)
     red, green, blue, gloss = base[0], base[1], base[2], 0.25
     end, width, height = faces.params[face, 0], faces.size[face, 0], faces.size[face, 1]
     if end > 0:
@@ -80,12 +85,12 @@ def _car_end(scene: Scene, hit: Hit) -> Any:
     return red, green, blue, gloss
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _car_side(scene: Scene, hit: Hit) -> Any:
     faces, face = scene.faces, hit.face
     length, height = faces.size[face, 0], faces.size[face, 1]
     shoulder = faces.params[face, 0]
-    base = faces.color[face]
+    base = _base(faces, face)
     u, v = hit.u / length, hit.v
     sill = band(v, 0.0, 0.36, hit.dv)
     front = 0.29 + 0.16 * (v - shoulder) / (height - shoulder) + 0.02  # slope of the windscreen
@@ -110,13 +115,13 @@ def _car_side(scene: Scene, hit: Hit) -> Any:
     )
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _disc(x: float, y: float, radius: float, hit: Hit) -> Any:
     width = 0.5 * (hit.du + hit.dv) + 1e-4
     return min(max((radius - np.sqrt(x * x + y * y)) / width + 0.5, 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _tyre(hit: Hit, scene: Scene) -> Any:
     radius = scene.faces.size[hit.face, 0]
     rim = _disc(hit.u, hit.v, 0.66 * radius, hit)
@@ -128,7 +133,7 @@ def _tyre(hit: Hit, scene: Scene) -> Any:
     return tone, tone, tone * 1.03, 0.0
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _sign(scene: Scene, hit: Hit) -> Any:
     """Return a sign: 0 round with a red ring, 1 blue, 2 yellow diamond, 3 a board with words."""
     faces, face = scene.faces, hit.face

@@ -187,5 +187,7 @@ def _add_trunk(
     face = Face(BARK, place.origin, color=(0.10 * tone, 0.075 * tone, 0.055 * tone))
     k = np.arange(16)
     after = (k + 1) % 8 + 8 * (k // 8)
-    triangles = np.concatenate([np.stack([k, after, after + 8], 1), np.stack([k, after + 8, k + 8], 1)])
+    triangles = np.concatenate(
+        [np.stack([k, after, after + 8], 1), np.stack([k, after + 8, k + 8], 1)]
+    )
     builder.add(face, place.world(np.concatenate(rings)), triangles)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from laser_slam.datasets.synthetic.facades import roof_color, wall_color
 from laser_slam.datasets.synthetic.ground import ground_color
 from laser_slam.datasets.synthetic.hit import Hit, make_hit
+from laser_slam.datasets.synthetic.kernels import inlined, kernel
 from laser_slam.datasets.synthetic.mesh import KERB, LEAF, ROOF, WALL
 from laser_slam.datasets.synthetic.objects import leaf_color, object_color
 from laser_slam.datasets.synthetic.textures import CLOUDS, noise
@@ -22,38 +22,37 @@ SKY_LIGHT = (0.50, 0.58, 0.72)
 HAZE_COLOR = (0.66, 0.73, 0.82)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shade(
     scene: Scene,
+    out: NDArray[np.float32],
     rays: NDArray[np.float32],
     triangles: NDArray[np.uint32],
     depth: NDArray[np.float32],
     camera: NDArray[np.float64],
-) -> NDArray[np.float32]:
+) -> None:
     """Colour rays.
 
     Args:
         scene: the world.
+        out: (N, 3) takes the linear RGB.
         rays: (N, 6) origins and directions, in world axes.
         triangles: (N,) what they hit.
         depth: (N,) how far, in lengths of the direction.
         camera: (2, 3) change of the direction to the next pixel, to the right and down.
-
-    Returns:
-        (N, 3) linear RGB.
     """
-    out = np.empty((len(rays), 3), np.float32)
     for i in range(len(rays)):
+        origin = float(rays[i, 0]), float(rays[i, 1]), float(rays[i, 2])
+        ray = (*origin, float(rays[i, 3]), float(rays[i, 4]), float(rays[i, 5]))
         if triangles[i] == NOTHING:
-            red, green, blue = sky_color(scene, rays[i, 3], rays[i, 4], rays[i, 5])
+            red, green, blue = sky_color(scene, ray[3], ray[4], ray[5])
         else:
-            hit = make_hit(scene, rays[i], camera, int(triangles[i]), float(depth[i]))
-            red, green, blue = _lit(scene, hit, rays[i])
+            hit = make_hit(scene, ray, camera, int(triangles[i]), float(depth[i]))
+            red, green, blue = _lit(scene, hit, ray)
         out[i, 0], out[i, 1], out[i, 2] = red, green, blue
-    return out
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def sky_color(scene: Scene, dx: float, dy: float, dz: float) -> Any:
     """Return the colour of the sky in a direction: a gradient, clouds, a glow about the sun."""
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -79,7 +78,7 @@ def sky_color(scene: Scene, dx: float, dy: float, dz: float) -> Any:
     return red + glow, green + 0.95 * glow, blue + 0.8 * glow
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _lit(scene: Scene, hit: Hit, ray: Any) -> Any:
     material = scene.faces.material[hit.face]
     red, green, blue, gloss = _albedo(scene, hit, material)
@@ -98,7 +97,7 @@ def _lit(scene: Scene, hit: Hit, ray: Any) -> Any:
     blue *= SUN_COLOR[2] * sun + SKY_LIGHT[2] * ambient
     if gloss > 0.02:
         red, green, blue = _reflected(scene, hit, ray, (red, green, blue), gloss)
-    length = np.sqrt(float(ray[3]) ** 2 + float(ray[4]) ** 2 + float(ray[5]) ** 2)
+    length = np.sqrt(ray[3] ** 2 + ray[4] ** 2 + ray[5] ** 2)
     seen = np.exp(-scene.haze * hit.depth * length)
     return (
         red * seen + HAZE_COLOR[0] * (1 - seen),
@@ -107,7 +106,7 @@ def _lit(scene: Scene, hit: Hit, ray: Any) -> Any:
     )
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _albedo(scene: Scene, hit: Hit, material: int) -> Any:
     if material <= KERB:
         red, green, blue = ground_color(scene, hit, material)
@@ -122,20 +121,21 @@ def _albedo(scene: Scene, hit: Hit, material: int) -> Any:
     return red, green, blue, 0.0
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _shading_normal(scene: Scene, hit: Hit, material: int) -> Any:
     """Round crowns off: their facets take the normal of the whole crown, half and half."""
     radius = scene.faces.params[hit.face, 0]
     if material != LEAF or radius <= 0:
         return hit.nx, hit.ny, hit.nz
-    origin = scene.faces.origin[hit.face]
-    ox, oy, oz = (hit.x - origin[0]) / radius, (hit.y - origin[1]) / radius, hit.z - origin[2]
-    nx, ny, nz = 0.5 * hit.nx + 0.8 * ox, 0.5 * hit.ny + 0.8 * oy, 0.5 * hit.nz + 0.8 * oz / radius
+    origin, share = scene.faces.origin, 0.8 / radius
+    nx = 0.5 * hit.nx + share * (hit.x - origin[hit.face, 0])
+    ny = 0.5 * hit.ny + share * (hit.y - origin[hit.face, 1])
+    nz = 0.5 * hit.nz + share * (hit.z - origin[hit.face, 2])
     length = np.sqrt(nx * nx + ny * ny + nz * nz) + 1e-9
     return nx / length, ny / length, nz / length
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _sunlit(scene: Scene, hit: Hit) -> Any:
     """Return the share of the sun that reaches the ground, from the raster, bilinearly."""
     frame = scene.sunlit_frame
@@ -150,10 +150,10 @@ def _sunlit(scene: Scene, hit: Hit) -> Any:
     return (upper * (1 - wz) + lower * wz) / 255.0
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _reflected(scene: Scene, hit: Hit, ray: Any, color: Any, gloss: float) -> Any:
     """Add the sky's mirror image: what glass and paint show at a slant."""
-    dx, dy, dz = float(ray[3]), float(ray[4]), float(ray[5])
+    dx, dy, dz = ray[3], ray[4], ray[5]
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
     facing = (dx * hit.nx + dy * hit.ny + dz * hit.nz) / length
     fresnel = 0.06 + 0.94 * (1.0 - min(-facing, 1.0)) ** 5

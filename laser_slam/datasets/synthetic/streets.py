@@ -9,10 +9,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
+
+from laser_slam.datasets.synthetic.kernels import inlined, kernel
 
 Array = NDArray[np.float64]
 
@@ -154,7 +155,7 @@ def _lookup(
     return nearest.reshape(rows, columns), crossing.reshape(rows, columns), origin
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _beside(streets: Streets, sample: int, x: float, z: float) -> Any:
     """Return (lateral, along, sample): metres right of the centre line, metres along it."""
     best, lateral, along, at = 1e18, 1e9, 0.0, sample
@@ -174,7 +175,7 @@ def _beside(streets: Streets, sample: int, x: float, z: float) -> Any:
     return lateral, along, at
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def locate(streets: Streets, x: float, z: float) -> Any:
     """Find a plan point on the streets.
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from laser_slam.datasets.synthetic.kernels import inlined, kernel
 
 GRAIN, CLOUDS, LEAVES = 0, 1, 2
 SIZE = 512
@@ -52,7 +53,7 @@ def _mip_chain(image: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([level.ravel() for level in levels])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _bilinear(textures: Textures, kind: int, x: float, y: float, level: int) -> Any:
     size = SIZE >> level
     fx, fy = x * size - 0.5, y * size - 0.5
@@ -61,13 +62,13 @@ def _bilinear(textures: Textures, kind: int, x: float, y: float, level: int) -> 
     mask, base = size - 1, textures.offsets[level]
     left, right = x0 & mask, (x0 + 1) & mask
     top, bottom = base + (y0 & mask) * size, base + ((y0 + 1) & mask) * size
-    row = textures.values[kind]
-    upper = row[top + left] * (1 - wx) + row[top + right] * wx
-    lower = row[bottom + left] * (1 - wx) + row[bottom + right] * wx
+    values = textures.values
+    upper = values[kind, top + left] * (1 - wx) + values[kind, top + right] * wx
+    lower = values[kind, bottom + left] * (1 - wx) + values[kind, bottom + right] * wx
     return upper * (1 - wy) + lower * wy
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def noise(textures: Textures, kind: int, x: float, y: float, footprint: float) -> Any:
     """Sample a noise image, filtered to the pixel's footprint; both in tiles (one period = 1)."""
     lod = np.log2(max(footprint * SIZE, 1.0))
@@ -79,7 +80,7 @@ def noise(textures: Textures, kind: int, x: float, y: float, footprint: float) -
     return fine * (1 - weight) + _bilinear(textures, kind, x, y, level + 1) * weight
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def hash01(a: int, b: int, c: int) -> Any:
     """Return a number in [0, 1) that looks random and depends on three integers only."""
     h = (a * 374761393 + b * 668265263 + c * 1274126177) & 0xFFFFFFFF
@@ -88,7 +89,7 @@ def hash01(a: int, b: int, c: int) -> Any:
     return (h ^ (h >> 15)) / 4294967296.0
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def band(x: float, low: float, high: float, width: float) -> Any:
     """Return the share of the interval of ``width`` around ``x`` that lies in [low, high]."""
     width = max(width, 1e-6)
@@ -96,13 +97,13 @@ def band(x: float, low: float, high: float, width: float) -> Any:
     return min(max(inside / width, 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def _pulse_integral(x: float, period: float, on: float) -> Any:
     cycles = np.floor(x / period)
     return cycles * on + min(x - cycles * period, on)
 
 
-@njit(cache=True, nogil=True)
+@inlined
 def pulse(x: float, period: float, on: float, width: float) -> Any:
     """Return the share of the interval of ``width`` around ``x`` where a pulse train is on.
 

@@ -78,9 +78,7 @@ def _add_strips(
         # params[0]: which end of the car this strip shows lamps for, 1 front, 2 rear
         end = 1.0 if k == 0 else 2.0 if k in (7, 8) else 0.0
         params = (end, 0.0, 0.0, 0.0)
-        builder.add_polygon(
-            Face(material, quad[0], *axes, size, color, color, params, seed), quad
-        )
+        builder.add_polygon(Face(material, quad[0], *axes, size, color, color, params, seed), quad)
 
 
 def _add_sides(
@@ -115,6 +113,8 @@ def _add_wheel(builder: MeshBuilder, place: Placement, foot: Array, radius: floa
     face = Face(TYRE, hub, axes[2], axes[1], (radius, radius))
     k = np.arange(16)
     after = (k + 1) % 16
-    tread = np.concatenate([np.stack([k, after, after + 16], 1), np.stack([k, after + 16, k + 16], 1)])
+    tread = np.concatenate(
+        [np.stack([k, after, after + 16], 1), np.stack([k, after + 16, k + 16], 1)]
+    )
     builder.add(face, place.world(np.concatenate([outer, inner])), tread)
     builder.add_polygon(face, place.world(outer))

@@ -107,9 +107,7 @@ def _raycaster(mesh: Mesh) -> Any:
     return raycaster
 
 
-def _sunlit_ground(
-    raycaster: Any, terrain: Terrain, sun: Array
-) -> tuple[NDArray[np.uint8], Array]:
+def _sunlit_ground(raycaster: Any, terrain: Terrain, sun: Array) -> tuple[NDArray[np.uint8], Array]:
     """Cast one ray to the sun from every cell of the ground near the streets."""
     rows, columns = terrain.ground_y.shape
     extent = np.array([rows - 1, columns - 1]) * 2.0
