@@ -37,11 +37,6 @@ class WindowsConfig(_Section):
     max_flow_px: float = Field(
         40.0, gt=0, description="motion with rotation that makes a keyframe anyway; px at 640 wide"
     )
-    assumed_focal: float = Field(
-        0.6,
-        gt=0,
-        description="focal length where it is unknown, in image widths; for parallax only",
-    )
 
     @model_validator(mode="after")
     def _overlap_leaves_new_frames(self) -> Self:
@@ -53,6 +48,14 @@ class WindowsConfig(_Section):
         return self
 
 
+class CalibrationConfig(_Section):
+    """What the run learns of the camera before it starts."""
+
+    keyframes: int = Field(
+        320, ge=0, description="first keyframes that calibrate the camera; 0: taken as given"
+    )
+
+
 class ClassicalConfig(_Section):
     """The default backbone: tracks, bundle adjustment, plane sweep; on the CPU."""
 
@@ -61,7 +64,9 @@ class ClassicalConfig(_Section):
     track_patch: int = Field(7, ge=5, le=31, description="side of the tracked patch, px")
     num_features: int = Field(600, ge=100, description="corners per frame")
     max_backward_px: float = Field(0.7, gt=0, description="forward-backward gap of a good track")
-    refine_radius: int = Field(5, ge=2, le=10, description="half side of the patches that are aligned, px")
+    refine_radius: int = Field(
+        5, ge=0, le=10, description="half side of the patches that are aligned, px; 0: none are"
+    )
     context: int = Field(15, ge=0, description="earlier keyframes that steady a window's solution")
     depth_width: int = Field(640, ge=96, description="width of the depth maps, px")
     num_planes: int = Field(64, ge=16, le=256, description="inverse depths that are tried")
@@ -126,7 +131,7 @@ class SyntheticConfig(_Section):
     focal: float = Field(0.58, ge=0.2, le=3, description="focal length, in image widths")
     seed: int = Field(0, ge=0, description="of path, world and noise")
     noise: float = Field(1.5, ge=0, le=50, description="sensor noise, grey levels of 255")
-    haze: float = Field(0.004, ge=0, le=0.1, description="light lost to the haze, per metre")
+    haze: float = Field(0.0028, ge=0, le=0.1, description="light lost to the haze, per metre")
 
 
 class RunConfig(_Section):
@@ -142,6 +147,7 @@ class Config(_Section):
 
     dataset: DatasetConfig = DatasetConfig()
     windows: WindowsConfig = WindowsConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
     backbone: BackboneConfig = BackboneConfig()
     registration: RegistrationConfig = RegistrationConfig()
     fusion: FusionConfig = FusionConfig()

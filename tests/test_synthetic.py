@@ -186,7 +186,7 @@ def test_a_path_over_a_bridge_is_refused() -> None:
     poses = np.tile(np.eye(4), (num, 1, 1))
     poses[:, 0, 3], poses[:, 2, 3] = 30 - 30 * np.cos(angle), 30 * np.sin(angle)
     poses[:, 1, 3] = np.linspace(0, 8, num)
-    with pytest.raises(DatasetError, match="lower at frame .*shorten it"):
+    with pytest.raises(DatasetError, match=r"lower at frame .*shorten it"):
         SyntheticDrive(SyntheticConfig(width=96, height=32), poses)
 
 
@@ -259,7 +259,7 @@ def test_a_saved_drive_reads_back(tmp_path: Path) -> None:
     assert [line[:3] for line in lines] == ["P0:", "P1:", "P2:", "P3:"]
     K = np.array(lines[0].split()[1:], float).reshape(3, 4)[:, :3]
     assert np.allclose(K, drive.info.intrinsics)
-    with pytest.raises(DatasetError, match="sequence 07 is in .* already; remove it"):
+    with pytest.raises(DatasetError, match=r"sequence 07 is in .* already; remove it"):
         save_kitti_layout(drive, tmp_path, "07")
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -85,7 +85,7 @@ class SyntheticDrive:
         """Say size, intrinsics and truth of the drive."""
         return self._info
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Generator[Frame, None, None]:
         """Render the frames in order, a few ahead of the reader."""
         num = len(self._world_from_cam)
         pool = ThreadPoolExecutor(WORKERS, thread_name_prefix="render")

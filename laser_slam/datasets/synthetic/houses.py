@@ -14,6 +14,7 @@ from laser_slam.datasets.synthetic.mesh import (
     Face,
     MeshBuilder,
     Placement,
+    as_color,
     box,
 )
 
@@ -102,8 +103,7 @@ def add_garden_wall(
 
 def _varied(colors: tuple[Color, ...], rng: np.random.Generator) -> Color:
     base = np.array(colors[int(rng.integers(len(colors)))])
-    r, g, b = np.clip(base * rng.uniform(0.75, 1.25) * rng.uniform(0.9, 1.1, 3), 0.01, 0.75)
-    return float(r), float(g), float(b)
+    return as_color(base * rng.uniform(0.75, 1.25) * rng.uniform(0.9, 1.1, 3))
 
 
 def _wall(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,12 @@ class Face:
     accent: Color = (0.5, 0.5, 0.5)
     params: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     seed: int = 0
+
+
+def as_color(rgb: Array) -> Color:
+    """Turn (3,) linear RGB to a colour, within what surfaces can have."""
+    red, green, blue = (float(value) for value in np.clip(rgb, 0.008, 0.8))
+    return red, green, blue
 
 
 class Faces(NamedTuple):
@@ -103,13 +109,19 @@ class MeshBuilder:
         columns = [
             np.array([getattr(face, name) for face in self._faces]) for name in Faces._fields
         ]
-        types = [np.int64 if c.dtype.kind == "i" else np.float32 for c in columns]
         return Mesh(
             np.concatenate(self._vertices).astype(np.float32),
             np.concatenate(self._triangles).astype(np.uint32),
             np.concatenate(self._triangle_face).astype(np.int32),
-            Faces(*(c.astype(t) for c, t in zip(columns, types, strict=True))),
+            _faces_from(columns),
         )
+
+
+def _faces_from(columns: list[NDArray[Any]]) -> Faces:
+    material, seed = columns[0].astype(np.int64), columns[-1].astype(np.int64)
+    looks = [look.astype(np.float32) for look in columns[1:-1]]
+    origin, u_axis, v_axis, size, color, accent, params = looks
+    return Faces(material, origin, u_axis, v_axis, size, color, accent, params, seed)
 
 
 @dataclass(frozen=True)

@@ -23,13 +23,13 @@ def leaf_color(scene: Scene, hit: Hit) -> Any:
     """Return the albedo of foliage: specks of leaves, clumps, darker inside and below."""
     faces, face = scene.faces, hit.face
     shift = hash01(faces.seed[face], 1, 31)
-    leaves = solid_noise(scene.textures, LEAVES, hit, 1.7, shift)
+    leaves = solid_noise(scene.textures, LEAVES, hit, 1.5, shift)
     clumps = solid_noise(scene.textures, LEAVES, hit, 7.3, shift + 0.4)
-    tone = 1.0 + 0.36 * leaves + 0.24 * clumps
+    tone = 1.0 + 0.46 * leaves + 0.24 * clumps
     radius = faces.params[face, 0]
     if radius > 0:
         height = (faces.origin[face, 1] - hit.y) / radius  # -1 below the crown, 1 on top
-        tone *= min(max(0.80 + 0.22 * height, 0.45), 1.1)
+        tone *= min(max(0.88 + 0.2 * height, 0.6), 1.12)
     tone = max(tone, 0.14)
     base = _base(faces, face)
     warm = 1.0 + 0.10 * clumps
@@ -46,9 +46,9 @@ def object_color(scene: Scene, hit: Hit, material: int) -> Any:
     if material == TYRE:
         return _tyre(hit, scene)
     if material == GLASS:
-        return 0.015, 0.018, 0.02, 1.0
+        return _screen(scene, hit)
     base = _base(scene.faces, hit.face)
-    if material == BARK or material == PLAIN:
+    if material in (BARK, PLAIN):
         tone = 1.0 + 0.12 * solid_noise(scene.textures, GRAIN, hit, 1.1, 0.2)
         tone += (0.2 if material == BARK else 0.05) * solid_noise(
             scene.textures, CLOUDS, hit, 1.9, 0.6
@@ -59,54 +59,83 @@ def object_color(scene: Scene, hit: Hit, material: int) -> Any:
 
 
 @inlined
+def _screen(scene: Scene, hit: Hit) -> Any:
+    """Return a windscreen between its pillars."""
+    base, width = _base(scene.faces, hit.face), scene.faces.size[hit.face, 0]
+    height = scene.faces.size[hit.face, 1]
+    level = hit.v / height
+    half = 0.5 * width - 0.05 - 0.21 * (level if hit.ny < 0 else 1 - level) * (width / 1.76)
+    glass = band(abs(hit.u), -1.0, half, hit.du) * band(level, 0.06, 0.94, hit.dv / height)
+    keep = 1.0 - glass
+    return (
+        base[0] * keep + 0.015 * glass,
+        base[1] * keep + 0.018 * glass,
+        base[2] * keep + 0.020 * glass,
+        0.2 * keep + glass,
+    )
+
+
+@inlined
 def _car_end(scene: Scene, hit: Hit) -> Any:
-    """Return paint, with lamps and a number plate at the front and the rear."""
+    """Return paint, with lamps, grille and number plate at the front and the rear."""
     faces, face = scene.faces, hit.face
-    base = _base(faces, face)
-    red, green, blue, gloss = base[0], base[1], base[2], 0.25
+    red, green, blue = _base(faces, face)
     end, width, height = faces.params[face, 0], faces.size[face, 0], faces.size[face, 1]
-    if end > 0:
-        middle = abs(hit.u - 0.5 * width)
-        level = hit.v / max(height, 1e-3)
-        if end > 1:
-            level = 1.0 - level
-        lamp = band(middle, 0.5 * width - 0.42, 0.5 * width - 0.05, hit.du)
-        lamp *= band(level, 0.45, 0.95, hit.dv / height)
-        plate = band(middle, -0.01, 0.26, hit.du) * band(level, 0.15, 0.5, hit.dv / height)
-        glow = (0.45, 0.45, 0.42) if end < 1.5 else (0.32, 0.015, 0.01)
-        red = red * (1 - lamp) + glow[0] * lamp
-        green = green * (1 - lamp) + glow[1] * lamp
-        blue = blue * (1 - lamp) + glow[2] * lamp
-        red, green, blue = (
-            red * (1 - plate) + 0.5 * plate,
-            green * (1 - plate) + 0.5 * plate,
-            blue * (1 - plate) + 0.42 * plate,
+    if end < 0.5:
+        return red, green, blue, 0.25
+    middle, level, dv = abs(hit.u), hit.v / height, hit.dv / height
+    if end > 1.5:
+        level = 1.0 - level
+    lamp = band(middle, 0.5 * width - 0.40, 0.5 * width - 0.04, hit.du) * band(level, 0.42, 0.9, dv)
+    plate = band(middle, -1.0, 0.26, hit.du) * band(level, 0.08, 0.46, dv)
+    grille = band(middle, -1.0, 0.5 * width - 0.44, hit.du) * band(level, 0.52, 0.88, dv)
+    grille *= 0.85 if end < 1.5 else 0.0
+    keep = (1.0 - grille) * (1.0 - plate) * (1.0 - lamp)
+    if end < 1.5:
+        return (
+            red * keep + 0.5 * plate + 0.42 * lamp,
+            green * keep + 0.5 * plate + 0.42 * lamp,
+            blue * keep + 0.47 * plate + 0.40 * lamp,
+            0.25 + 0.4 * lamp,
         )
-    return red, green, blue, gloss
+    inner = 0.5 if middle < 0.5 * width - 0.26 else 1.0
+    return (
+        red * keep + 0.5 * plate + 0.30 * inner * lamp,
+        green * keep + 0.48 * plate + 0.012 * lamp,
+        blue * keep + 0.30 * plate + 0.010 * lamp,
+        0.25,
+    )
 
 
 @inlined
 def _car_side(scene: Scene, hit: Hit) -> Any:
+    """Return doors, windows and wheel arches; u runs from the front to the rear."""
     faces, face = scene.faces, hit.face
     length, height = faces.size[face, 0], faces.size[face, 1]
-    shoulder = faces.params[face, 0]
+    belt = faces.accent[face, 0]
     base = _base(faces, face)
-    u, v = hit.u / length, hit.v
-    sill = band(v, 0.0, 0.36, hit.dv)
-    front = 0.29 + 0.16 * (v - shoulder) / (height - shoulder) + 0.02  # slope of the windscreen
-    glass = band(v, shoulder + 0.04, height - 0.09, hit.dv)
-    glass *= band(u, front, 0.80 - 0.09 * (v - shoulder) / (height - shoulder), hit.du / length)
-    glass *= 1.0 - band(u, 0.52, 0.545, hit.du / length)
-    door = band(u, 0.325, 0.331, hit.du / length) + band(u, 0.53, 0.536, hit.du / length)
-    door += band(u, 0.73, 0.736, hit.du / length)
-    door *= band(v, 0.36, shoulder + 0.02, hit.dv)
-    handle = band(v, shoulder - 0.12, shoulder - 0.08, hit.dv)
-    handle *= band(u, 0.47, 0.51, hit.du / length) + band(u, 0.68, 0.72, hit.du / length)
-    arch = _disc(u * length - 0.185 * length, v - 0.22 * height, 0.28 * height, hit)
-    arch = max(arch, _disc(u * length - 0.815 * length, v - 0.22 * height, 0.28 * height, hit))
-    dark = min(max(max(0.8 * sill, arch), 0.7 * max(door, handle)), 1.0)
+    u, v, du = hit.u / length, hit.v, hit.du / length
+    rise = min(max((v - belt) / (height - belt), 0.0), 1.0)
+    front = faces.params[face, 0] + (faces.params[face, 1] - faces.params[face, 0]) * rise
+    rear = faces.params[face, 3] + (faces.params[face, 2] - faces.params[face, 3]) * rise
+    glass = band(v, belt + 0.03, height - 0.10, hit.dv) * band(u, front + 0.025, rear - 0.03, du)
+    pillar = 0.53 if rear > 0.6 else 0.50
+    glass *= (1.0 - band(u, pillar, pillar + 0.022, du)) * (1.0 - band(u, 0.735, 0.75, du))
+    seam = band(u, 0.315, 0.319, du) + band(u, pillar + 0.01, pillar + 0.014, du)
+    seam += band(u, 0.742, 0.746, du)
+    seam *= band(v, 0.32, belt + 0.02, hit.dv)
+    handle = band(v, belt - 0.12, belt - 0.09, hit.dv)
+    handle *= band(u, 0.475, 0.51, du) + band(u, 0.69, 0.725, du)
+    crease = 0.25 * band(v, belt - 0.22, belt - 0.2, hit.dv)
+    wheel = 0.185 if height < 1.8 else 0.16
+    radius = 0.27 * min(height, 1.5)
+    level = v - 0.22 * min(height, 1.5)
+    arch = _disc((u - wheel) * length, level, radius, hit)
+    arch = max(arch, _disc((u - 1.0 + wheel) * length, level, radius, hit))
+    sill = band(v, 0.0, 0.30, hit.dv)
+    dark = min(max(0.85 * sill, arch, 0.75 * max(seam, handle), crease), 1.0)
     keep = (1 - dark) * (1 - glass)
-    hold = 0.015 * (1 - keep)
+    hold = 0.012 * (1 - keep)
     return (
         base[0] * keep + hold,
         base[1] * keep + hold,

@@ -6,7 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from laser_slam.datasets.synthetic.mesh import BARK, LEAF, Color, Face, MeshBuilder, Placement
+from laser_slam.datasets.synthetic.mesh import (
+    BARK,
+    LEAF,
+    Color,
+    Face,
+    MeshBuilder,
+    Placement,
+    as_color,
+)
 
 Array = NDArray[np.float64]
 
@@ -45,7 +53,7 @@ def add_tree(
         detail: 2 beside the street, 1 far from it: fewer triangles.
     """
     base = np.array(LEAF_COLORS[int(rng.integers(len(LEAF_COLORS)))])
-    color = tuple(float(c) for c in base * rng.uniform(0.8, 1.3) * rng.uniform(0.92, 1.08, 3))
+    color = as_color(base * rng.uniform(0.8, 1.3) * rng.uniform(0.92, 1.08, 3))
     radius = 0.018 * height + 0.06
     _add_trunk(builder, place, radius, 0.6 * height, rng)
     if rng.random() < 0.2:
@@ -74,7 +82,7 @@ def add_hedge(
     triangles = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
     caps = [[end[0], end[k], end[k + 1]] for end in (index[0], index[-1]) for k in range(1, 7)]
     base = np.array(LEAF_COLORS[int(rng.integers(4))]) * rng.uniform(0.8, 1.2)
-    face = _leaf_face(place.world(np.array([0, 0.5 * height, -0.35])), tuple(base), 0.0, rng)
+    face = _leaf_face(place.world(np.array([0, 0.5 * height, -0.35])), as_color(base), 0.0, rng)
     triangles = np.concatenate([triangles, np.array(caps)])
     builder.add(face, place.world(points.reshape(-1, 3)), triangles)
 
@@ -85,10 +93,10 @@ def add_shrub(
     """Add a round shrub at ``place``."""
     base = np.array(LEAF_COLORS[int(rng.integers(len(LEAF_COLORS)))]) * rng.uniform(0.8, 1.3)
     center = place.world(np.array([0.0, 0.7 * radius, 0.0]))
-    face = _leaf_face(center, tuple(base), radius, rng)
+    face = _leaf_face(center, as_color(base), radius, rng)
     vertices, triangles = _blob(center, np.full(3, radius), COARSE, rng)
     builder.add(face, vertices, triangles)
-    builder.add(face, *_clumps(center, np.full(3, radius), 40, rng))
+    builder.add(face, *_clumps(center, np.full(3, radius), 110, rng))
 
 
 def _leaf_face(center: Array, color: Color, radius: float, rng: np.random.Generator) -> Face:
@@ -114,8 +122,8 @@ def _clumps(
     """Return loose leaf-covered triangles around an ellipsoid: they fray its outline."""
     out = rng.standard_normal((num, 3))
     out /= np.linalg.norm(out, axis=1, keepdims=True)
-    middle = center + out * radii * rng.uniform(0.92, 1.16, (num, 1))
-    size = rng.uniform(0.10, 0.26, (num, 1, 1)) * (0.6 + 0.25 * float(radii.mean()))
+    middle = center + out * radii * rng.uniform(0.90, 1.13, (num, 1))
+    size = rng.uniform(0.05, 0.13, (num, 1, 1)) * (0.7 + 0.25 * float(radii.mean()))
     corners = middle[:, None] + rng.standard_normal((num, 3, 3)) * size
     return corners.reshape(-1, 3), np.arange(3 * num).reshape(-1, 3)
 
@@ -141,7 +149,7 @@ def _add_crown(
         radii = spread * rng.uniform(0.5, 0.72) * np.array([1.0, rng.uniform(0.75, 0.95), 1.0])
         center = place.world(middle + offset)
         builder.add(face, *_blob(center, radii, FINE if detail > 1 else COARSE, rng))
-        builder.add(face, *_clumps(center, radii, 70 if detail > 1 else 24, rng))
+        builder.add(face, *_clumps(center, radii, 190 if detail > 1 else 30, rng))
 
 
 def _add_conifer(

@@ -17,8 +17,8 @@ from laser_slam.datasets.synthetic.textures import CLOUDS, noise
 from laser_slam.datasets.synthetic.world import Scene
 
 NOTHING = 0xFFFFFFFF  # what Open3D calls the triangle of a ray that hits none
-SUN_COLOR = (1.75, 1.62, 1.38)
-SKY_LIGHT = (0.50, 0.58, 0.72)
+SUN_COLOR = (2.45, 2.25, 1.90)
+SKY_LIGHT = (0.46, 0.55, 0.70)
 HAZE_COLOR = (0.66, 0.73, 0.82)
 
 

@@ -15,7 +15,6 @@ from laser_slam.datasets.synthetic.paths import CAMERA_HEIGHT_M
 from laser_slam.datasets.synthetic.streets import (
     HALF_ROAD_M,
     PAVEMENT_M,
-    REACH_M,
     Streets,
 )
 from laser_slam.errors import DatasetError
@@ -88,9 +87,9 @@ def make_terrain(world_from_cam: Array, streets: Streets, seed: int) -> Terrain:
 def _interpolated(shape: tuple[int, int], cells: Array, values: Array) -> Array:
     """Spread scattered values over a raster, smoothly, the near ones first."""
     total, weight = np.zeros(shape), np.zeros(shape)
-    corner = np.floor(cells).astype(int)
+    corner = np.floor(cells).astype(np.int64)
     for dx, dz in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        at = corner + (dx, dz)
+        at = corner + np.array([dx, dz])
         share = np.prod(1.0 - np.abs(cells - at), axis=1)
         np.add.at(total, (at[:, 1], at[:, 0]), values * share)
         np.add.at(weight, (at[:, 1], at[:, 0]), share)
@@ -150,7 +149,7 @@ def _add_pavement(
     folded = inner & ~outer  # the pavement's outer rail is pulled in to the kerb's back
     for k, material in ((0, KERB), (1, KERB), (2, PAVEMENT), (3, KERB)):
         _add_strip(builder, Face(material), corners[k], corners[k + 1], inner & (outer | (k < 2)))
-    narrow = points + min(offsets[3], REACH_M) * 0 * right + (HALF_ROAD_M + 0.9) * right
+    narrow = points + (HALF_ROAD_M + 0.9) * right
     edge = np.stack([narrow[:, 0], top - 0.02, narrow[:, 1]], axis=1)
     _add_strip(builder, Face(PAVEMENT), corners[2], edge, folded)
 

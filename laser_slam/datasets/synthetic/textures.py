@@ -29,7 +29,7 @@ class Textures(NamedTuple):
 def make_textures(seed: int) -> Textures:
     """Draw the noise images: grain and clouds by their spectrum, leaves by the sign of noise."""
     rng = np.random.default_rng((seed, 2))
-    leaves = np.tanh(2.5 * _spectral(0.75, rng)) + 0.5 * _spectral(1.3, rng)
+    leaves = np.tanh(2.0 * _spectral(0.55, rng)) + 0.45 * _spectral(1.2, rng)
     images = [_spectral(0.5, rng), _spectral(1.25, rng), leaves]
     rows = [_mip_chain((image - image.mean()) / image.std()) for image in images]
     sizes = [(SIZE >> level) ** 2 for level in range(LEVELS)]
