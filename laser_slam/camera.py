@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+COMMON_FOCAL = 0.6  # image widths: 80 degrees, between a telephone and a dashcam
+
 
 def intrinsics_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
     """Return the (3, 3) intrinsics in pixels."""
@@ -28,6 +30,12 @@ def intrinsics_from_fov(fov_deg: float, height: int, width: int) -> Array:
     return intrinsics_matrix(
         round(float(focal), 9), round(float(focal), 9), (width - 1) / 2, (height - 1) / 2
     )
+
+
+def guess_intrinsics(height: int, width: int) -> Array:
+    """Return the intrinsics of a common camera, for images of which nothing is known."""
+    focal = COMMON_FOCAL * width
+    return intrinsics_matrix(focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def resize_intrinsics(intrinsics: Array, size: tuple[int, int], new_size: tuple[int, int]) -> Array:
@@ -66,3 +74,14 @@ def project(points: Array, intrinsics: Array) -> Array:
     u = intrinsics[0, 0] * points[..., 0] / z + intrinsics[0, 2]
     v = intrinsics[1, 1] * points[..., 1] / z + intrinsics[1, 2]
     return np.stack([u, v], axis=-1)
+
+
+def distort(rays: Array, distortion: Array) -> Array:
+    """Apply radial distortion to (..., 2) ray slopes x / z, y / z.
+
+    Args:
+        rays: (..., 2).
+        distortion: (2,) k1, k2 as OpenCV defines them.
+    """
+    r2 = (rays**2).sum(axis=-1, keepdims=True)
+    return np.asarray(rays * (1 + r2 * (distortion[0] + r2 * distortion[1])))

@@ -270,7 +270,7 @@ def _how_to_go_on(pipeline: Pipeline) -> str:
         return "laser-slam: interrupted; nothing is kept"
     way = "goes on"
     if pipeline.backbone.remembers:
-        way = f"starts again there, for {pipeline.backbone.name} needs the windows before"
+        way = "starts again there, for this backbone needs the windows before"
     return (
         f"laser-slam: interrupted; {kept} windows are kept in {folder}; "
         f"the same command with --out {folder} {way}"

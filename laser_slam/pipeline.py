@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import zlib
 from collections.abc import Callable, Iterator
+from contextlib import closing
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ from laser_slam.errors import DatasetError, RunFolderError
 from laser_slam.evaluation.trajectory import evaluate_trajectory
 from laser_slam.export import write_ply
 from laser_slam.fusion import fuse
+from laser_slam.rectification import Rectifier, load_calibration, save_calibration
 from laser_slam.report import stages_picture
 from laser_slam.results import (
     Results,
@@ -46,7 +49,7 @@ from laser_slam.store import (
     open_run_folder,
     save_prediction,
 )
-from laser_slam.types import Cloud, Image, Prediction, Submap, Trajectory, Window
+from laser_slam.types import Calibration, Cloud, Image, Prediction, Submap, Trajectory, Window
 from laser_slam.windows import cut_windows, select_keyframes
 
 Progress = Callable[[str, int, int | None], None]
@@ -92,6 +95,11 @@ class Pipeline:
         self.backbone = backbone or make_backbone(config.backbone)
         self._on_progress = on_progress
         self._slam = Slam(config)
+        self._size = self.backbone.image_size(self._info.size)
+        self._calibration = Calibration(
+            self._given(), np.zeros(2), self._size, self._info.intrinsics_source
+        )
+        self._rectifier = Rectifier(self._calibration, self._size)
         self._input = FrameLog()
         self._intrinsics: list[NDArray[np.float64]] = []
         self._clock = StageClock()
@@ -106,6 +114,8 @@ class Pipeline:
         """
         self._open_folder()
         with run_log(self.folder / "run.log") as warnings:
+            with self._clock.stage("calibrate"):
+                self._calibrate()
             for window in self._windows():
                 prediction, colors = self._predict(window)
                 self._place(prediction, colors)
@@ -126,6 +136,31 @@ class Pipeline:
         if is_resumed:
             logger.info("resuming the run in %s", self.folder)
 
+    def _calibrate(self) -> None:
+        """Learn how the camera projects, from the first keyframes; rectify images by it."""
+        path = self.folder / "calibration.yaml"
+        if path.exists():
+            self._calibration = load_calibration(path)
+        elif self._config.calibration.keyframes:
+            self._calibration = self.backbone.calibrate(self._first_windows(), self._given())
+            save_calibration(path, self._calibration)
+        self._rectifier = Rectifier(self._calibration, self._size)
+        logger.info("calibration: %s", self._calibration.source)
+
+    def _first_windows(self) -> Iterator[Window]:
+        """Cut windows from the first keyframes, as the camera sees them."""
+        info, config = self._info, self._config.windows
+        with closing(self._dataset.frames()) as frames:
+            keyframes = select_keyframes(frames, config, info.intrinsics, info.size)
+            first = islice(keyframes, self._config.calibration.keyframes)
+            as_seen = Calibration(None, np.zeros(2), self._size, "")
+            yield from cut_windows(first, config, Rectifier(as_seen, self._size).image)
+
+    def _given(self) -> NDArray[np.float64] | None:
+        """Return the intrinsics that came with the data set, in pixels of the backbone's images."""
+        given = self._info.intrinsics
+        return None if given is None else resize_intrinsics(given, self._info.size, self._size)
+
     def _windows(self) -> Iterator[Window]:
         """Read the frames, choose keyframes, cut windows: lazily, one window at a time."""
         info, config, clock = self._info, self._config.windows, self._clock
@@ -133,8 +168,7 @@ class Pipeline:
         keyframes = clock.timed(
             "keyframes", select_keyframes(frames, config, info.intrinsics, info.size)
         )
-        size = self.backbone.image_size(info.size)
-        return clock.timed("windows", cut_windows(keyframes, config, size))
+        return clock.timed("windows", cut_windows(keyframes, config, self._rectifier.image))
 
     def _predict(self, window: Window) -> tuple[Prediction, Image]:
         """Ask the backbone, or read what it said of this window before the run was broken off."""
@@ -150,7 +184,7 @@ class Pipeline:
         else:
             with self._clock.stage("predict"):
                 prediction = self.backbone.predict(
-                    window.images, window.frames, self._intrinsics_of(window)
+                    window.images, window.frames, self._rectifier.intrinsics
                 )
             with self._clock.stage("store"):
                 colors = _resize(window.images, prediction.depth.shape[1:])
@@ -158,12 +192,6 @@ class Pipeline:
         for warning in prediction.warnings:
             logger.warning("window %d: %s", window.index, warning)
         return prediction, colors
-
-    def _intrinsics_of(self, window: Window) -> NDArray[np.float64] | None:
-        if self._info.intrinsics is None:
-            return None
-        height, width = window.images[0].shape[:2]
-        return resize_intrinsics(self._info.intrinsics, self._info.size, (height, width))
 
     def _place(self, prediction: Prediction, colors: Image) -> None:
         with self._clock.stage("register"):
@@ -199,11 +227,15 @@ class Pipeline:
             errors = evaluate_trajectory(trajectory, truth)
         depth = score_depth(
             views,
-            self._dataset.true_depth,
+            self._true_depth,
             errors.scale if errors else None,
             self._config.fusion.min_confidence,
         )
         return Scores(errors, depth, views)
+
+    def _true_depth(self, frame: int) -> NDArray[np.float32] | None:
+        truth = self._dataset.true_depth(frame)
+        return None if truth is None else self._rectifier.depth(truth)
 
     def _write(self, trajectory: Trajectory, cloud: Cloud, scores: Scores) -> None:
         with self._clock.stage("write"):
@@ -218,7 +250,7 @@ class Pipeline:
 
     def _report(self, cloud: Cloud, scores: Scores, warnings: list[str]) -> dict[str, Any]:
         return {
-            "sequence": describe_sequence(self._info, self._intrinsics),
+            "sequence": describe_sequence(self._info, self._calibration, self._intrinsics),
             "frames": {**self._input.counts(), "keyframes": self._slam.num_keyframes},
             "windows": {"num": len(self._slam.nodes), "bridged": self._slam.bridged},
             "trajectory": scores.trajectory.numbers() if scores.trajectory else None,

@@ -28,7 +28,7 @@ from laser_slam.report import (
 )
 from laser_slam.slam import Node
 from laser_slam.store import write_text
-from laser_slam.types import Cloud, Image, Prediction, SequenceInfo, Trajectory
+from laser_slam.types import Calibration, Cloud, Image, Prediction, SequenceInfo, Trajectory
 
 Array = NDArray[np.float64]
 
@@ -86,12 +86,15 @@ class Scores:
     views: Sequence[KeyframeView]
 
 
-def describe_sequence(info: SequenceInfo, intrinsics: Sequence[Array]) -> dict[str, Any]:
+def describe_sequence(
+    info: SequenceInfo, calibration: Calibration, intrinsics: Sequence[Array]
+) -> dict[str, Any]:
     """Describe the input, and with which calibration it was taken.
 
     Args:
         info: what the data set knows.
-        intrinsics: (3, 3) of each window, in pixels of the images, as the backbone used them.
+        calibration: what the run took for the camera, lens included.
+        intrinsics: (3, 3) of each window, in pixels of rectified images, as the backbone used them.
     """
     return {
         "name": info.name,
@@ -101,6 +104,8 @@ def describe_sequence(info: SequenceInfo, intrinsics: Sequence[Array]) -> dict[s
         "intrinsics": _four_numbers(np.median(intrinsics, axis=0)),
         "intrinsics_given": None if info.intrinsics is None else _four_numbers(info.intrinsics),
         "intrinsics_source": info.intrinsics_source,
+        "calibration": calibration.source,
+        "distortion": [round(float(k), 6) for k in calibration.distortion],
     }
 
 

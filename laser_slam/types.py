@@ -75,6 +75,23 @@ class SequenceInfo:
 
 
 @dataclass(frozen=True)
+class Calibration:
+    """How the camera projects.
+
+    Attributes:
+        intrinsics: (3, 3) in pixels; None: unknown, the backbone finds its own for each window.
+        distortion: (2,) radial k1, k2 as OpenCV defines them.
+        size: (height, width) of the images that it is for.
+        source: where it comes from, in words.
+    """
+
+    intrinsics: NDArray[np.float64] | None
+    distortion: NDArray[np.float64]
+    size: tuple[int, int]
+    source: str
+
+
+@dataclass(frozen=True)
 class Window:
     """Consecutive keyframes that are given to the backbone at once.
 

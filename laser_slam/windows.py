@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.camera import intrinsics_matrix, resize_intrinsics
+from laser_slam.camera import guess_intrinsics, resize_intrinsics
 from laser_slam.config import WindowsConfig
 from laser_slam.errors import DegenerateGeometryError
 from laser_slam.sim3 import orthonormal
@@ -84,7 +84,7 @@ def select_keyframes(
 
 
 def cut_windows(
-    keyframes: Iterable[Frame], config: WindowsConfig, image_size: tuple[int, int]
+    keyframes: Iterable[Frame], config: WindowsConfig, rectify: Callable[[Image], Image]
 ) -> Iterator[Window]:
     """Cut keyframes into windows that share ``overlap`` of them; each as soon as it is full.
 
@@ -93,7 +93,7 @@ def cut_windows(
     Args:
         keyframes: in order; those without image are skipped.
         config: size and overlap of the windows.
-        image_size: (height, width) of the windows' images.
+        rectify: makes an image of the sequence one as the backbone wants it.
 
     Raises:
         DegenerateGeometryError: fewer than 2 keyframes in all.
@@ -103,7 +103,7 @@ def cut_windows(
     for frame in keyframes:
         if frame.image is None:
             continue
-        recent.append((frame.index, _resize(frame.image, image_size)))
+        recent.append((frame.index, rectify(frame.image)))
         num_new += 1
         if num_new == config.size - (config.overlap if num_windows else 0):
             yield _window(num_windows, recent)
@@ -123,8 +123,7 @@ class _MotionTracker:
         width = min(SMALL_WIDTH, size[1])
         self._size = (max(1, round(size[0] * width / size[1])), width)
         if intrinsics is None:
-            focal = config.assumed_focal * size[1]
-            intrinsics = intrinsics_matrix(focal, focal, (size[1] - 1) / 2, (size[0] - 1) / 2)
+            intrinsics = guess_intrinsics(*size)
         self._intrinsics = resize_intrinsics(intrinsics, size, self._size)
         self._previous: Grey | None = None
         self._start = self._points = np.zeros((0, 2), np.float32)
@@ -231,14 +230,6 @@ def _flow(previous: Grey, current: Grey, points: Points) -> tuple[Points, NDArra
         maxLevel=PYRAMID_LEVELS,
     )
     return end, found.ravel() == 1
-
-
-def _resize(image: Image, size: tuple[int, int]) -> Image:
-    if image.shape[:2] == size:
-        return image
-    shrinks = size[0] * size[1] < image.shape[0] * image.shape[1]
-    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(image, (size[1], size[0]), interpolation=method))
 
 
 def _window(index: int, recent: Iterable[tuple[int, Image]]) -> Window:

@@ -1,6 +1,6 @@
 """A corridor with analytic depth: a data set and a backbone whose every answer is known."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,7 +8,16 @@ from numpy.typing import NDArray
 
 from laser_slam.camera import intrinsics_from_fov, rays
 from laser_slam.sim3 import Sim3, rotation_exp
-from laser_slam.types import Frame, Image, Prediction, SequenceInfo, Trajectory, WindowStatus
+from laser_slam.types import (
+    Calibration,
+    Frame,
+    Image,
+    Prediction,
+    SequenceInfo,
+    Trajectory,
+    Window,
+    WindowStatus,
+)
 
 SIZE = (72, 128)
 STEP_M = 0.4
@@ -69,7 +78,7 @@ class Corridor:
             truth=Trajectory(frames, frames / 10.0, poses) if self.with_truth else None,
         )
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Generator[Frame, None, None]:
         for index in range(self.num_frames):
             image = None if index in self.unreadable else view(index)[0]
             yield Frame(index, index / 10.0, image)
@@ -107,11 +116,15 @@ class TrueBackbone:
     statuses: dict[int, WindowStatus] = field(default_factory=dict)
     interrupt_at: int | None = None
     calls: int = 0
-    name: str = "true"
     remembers: bool = False
 
     def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
         return size
+
+    def calibrate(
+        self, windows: Iterable[Window], intrinsics: NDArray[np.float64] | None
+    ) -> Calibration:
+        return Calibration(intrinsics, np.zeros(2), SIZE, "given")
 
     def predict(
         self,

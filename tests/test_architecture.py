@@ -7,7 +7,16 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "laser_slam"
 ROOTS = ["errors", "dependencies", "sim3", "camera", "types", "config", "store"]
-STAGES = ["datasets", "windows", "backbones", "registration", "fusion", "export", "evaluation"]
+STAGES = [
+    "datasets",
+    "windows",
+    "rectification",
+    "backbones",
+    "registration",
+    "fusion",
+    "export",
+    "evaluation",
+]
 STAGES += ["viewer", "report", "layers", "places", "pose_graph"]
 COMPOSITION = ["closures", "slam", "bookkeeping", "results", "rescoring", "pipeline"]
 COMPOSITION += ["console", "cli"]

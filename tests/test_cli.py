@@ -163,7 +163,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(
 
     def fill_up(descriptor: int) -> None:
         synced.append(descriptor)
-        if len(synced) > 3:  # sequence, settings, one window
+        if len(synced) > 4:  # sequence, settings, calibration, one window
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("laser_slam.store.os.fsync", fill_up)

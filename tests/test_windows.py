@@ -15,13 +15,18 @@ from laser_slam.config import WindowsConfig
 from laser_slam.datasets.images import ImageFolder
 from laser_slam.datasets.kitti import KittiOdometry
 from laser_slam.errors import DegenerateGeometryError
+from laser_slam.rectification import Rectifier
 from laser_slam.sim3 import rotation_exp
-from laser_slam.types import Frame, Image
+from laser_slam.types import Calibration, Frame, Image
 from laser_slam.windows import cut_windows, rotation_residual, select_keyframes
 
 HEIGHT, WIDTH = 240, 640
 INTRINSICS = intrinsics_matrix(400.0, 400.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
 CONFIG = WindowsConfig()
+
+
+def resized(size: tuple[int, int]) -> Callable[[Image], Image]:
+    return Rectifier(Calibration(None, np.zeros(2), size, ""), size).image
 
 
 def texture(seed: int) -> NDArray[np.float32]:
@@ -218,7 +223,7 @@ def keyframes(num: int, on_read: Callable[[int], None] = lambda _: None) -> Iter
 @pytest.mark.parametrize(("size", "overlap"), [(3, 1), (5, 2), (6, 5), (12, 3)])
 def test_windows_cover_all_keyframes_and_overlap(num: int, size: int, overlap: int) -> None:
     config = WindowsConfig(size=size, overlap=overlap)
-    windows = list(cut_windows(keyframes(num), config, (6, 8)))
+    windows = list(cut_windows(keyframes(num), config, resized((6, 8))))
     assert [window.index for window in windows] == list(range(len(windows)))
     covered = np.unique(np.concatenate([window.frames for window in windows]))
     np.testing.assert_array_equal(covered, 3 * np.arange(num))
@@ -236,7 +241,7 @@ def test_windows_cover_all_keyframes_and_overlap(num: int, size: int, overlap: i
 def test_a_window_comes_as_soon_as_it_is_full() -> None:
     read: list[int] = []
     config = WindowsConfig(size=5, overlap=2)
-    windows = cut_windows(keyframes(100, read.append), config, (6, 8))
+    windows = cut_windows(keyframes(100, read.append), config, resized((6, 8)))
     assert len(list(islice(windows, 1))) == 1
     assert len(read) == 5
     next(windows)
@@ -245,7 +250,7 @@ def test_a_window_comes_as_soon_as_it_is_full() -> None:
 
 @pytest.mark.parametrize("size", [(3, 4), (6, 8), (12, 16)])
 def test_images_are_resized_to_what_the_backbone_wants(size: tuple[int, int]) -> None:
-    window = next(cut_windows(keyframes(3), WindowsConfig(size=3, overlap=1), size))
+    window = next(cut_windows(keyframes(3), WindowsConfig(size=3, overlap=1), resized(size)))
     assert [image.shape for image in window.images] == [(*size, 3)] * 3
     assert [int(image.mean()) for image in window.images] == [0, 1, 2]
 
@@ -254,15 +259,15 @@ def test_shrinking_averages_instead_of_picking_pixels() -> None:
     stripes = np.zeros((8, 16, 3), np.uint8)
     stripes[:, ::4] = 200
     frames = [Frame(index, index, stripes) for index in range(3)]
-    window = next(cut_windows(frames, WindowsConfig(size=3, overlap=1), (2, 4)))
+    window = next(cut_windows(frames, WindowsConfig(size=3, overlap=1), resized((2, 4))))
     assert np.all(window.images[0] == 50)
 
 
 def test_too_few_keyframes_are_refused_with_advice() -> None:
     with pytest.raises(DegenerateGeometryError, match=r"only 1 keyframe: .*min_parallax_px"):
-        list(cut_windows(keyframes(1), CONFIG, (6, 8)))
+        list(cut_windows(keyframes(1), CONFIG, resized((6, 8))))
     with pytest.raises(DegenerateGeometryError, match="no image shows enough texture"):
-        list(cut_windows(keyframes(0), CONFIG, (6, 8)))
+        list(cut_windows(keyframes(0), CONFIG, resized((6, 8))))
 
 
 # Real images

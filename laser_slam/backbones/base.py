@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.types import Image, Prediction
+from laser_slam.types import Calibration, Image, Prediction, Window
 
 
 class Backbone(Protocol):
     """A frozen model of the world: the images of one window in, geometry out."""
-
-    @property
-    def name(self) -> str:
-        """Name it as the settings do."""
-        ...
 
     @property
     def remembers(self) -> bool:
@@ -29,6 +24,17 @@ class Backbone(Protocol):
 
     def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return the (height, width) at which it wants images of (height, width) ``size``."""
+        ...
+
+    def calibrate(
+        self, windows: Iterable[Window], intrinsics: NDArray[np.float64] | None
+    ) -> Calibration:
+        """Say how the camera projects, before the run; images are then rectified by it.
+
+        Args:
+            windows: some of the sequence, at ``image_size``.
+            intrinsics: (3, 3) in pixels of these images; None: unknown.
+        """
         ...
 
     def predict(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +19,7 @@ class Dataset(Protocol):
         """Say what is known before the images are read."""
         ...
 
-    def frames(self) -> Iterator[Frame]:
+    def frames(self) -> Generator[Frame, None, None]:
         """Read the frames in order; each call starts anew. Unreadable images come as None."""
         ...
 

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from laser_slam.backbones.classical.calibration import calibrate
 from laser_slam.backbones.classical.dense import PosedFrames, dense_depth, depth_size
 from laser_slam.backbones.classical.reconstruction import Reconstruction, Solver
 from laser_slam.backbones.classical.tracking import FrameTracks, Tracker
 from laser_slam.backbones.classical.twoview import measure_motion
-from laser_slam.camera import intrinsics_matrix, resize_intrinsics
+from laser_slam.camera import guess_intrinsics, resize_intrinsics
 from laser_slam.config import BackboneConfig
 from laser_slam.sim3 import Array, interpolate_poses
-from laser_slam.types import Image, Prediction, WindowStatus
+from laser_slam.types import Calibration, Image, Prediction, Window, WindowStatus
 
-DEFAULT_FOCAL = 0.6  # of the width, where nothing is known
 STILL_PX, MOVED_PX = 1.0, 1.5  # parallax and flow at 640 wide
 MAX_WINDOW = 128
-BLUR_PX = 0.7  # of the images whose patches are compared
 
 
 class ClassicalBackbone:
@@ -31,8 +31,6 @@ class ClassicalBackbone:
     It remembers the tracks and poses of the last frames: a window that continues the one before is
     solved together with that context, which keeps its scale. Any other window starts afresh.
     """
-
-    name = "classical"
 
     def __init__(self, config: BackboneConfig) -> None:
         self._config = config.classical
@@ -45,6 +43,12 @@ class ClassicalBackbone:
     def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return the (height, width) at which it wants images of (height, width) ``size``."""
         return depth_size(size, self._config.max_width)
+
+    def calibrate(
+        self, windows: Iterable[Window], intrinsics: NDArray[np.float64] | None
+    ) -> Calibration:
+        """Measure the camera by its own motion; see `laser_slam.backbones.base.Backbone`."""
+        return calibrate(windows, intrinsics, self._config, self._workers)
 
     def predict(
         self,
@@ -80,18 +84,15 @@ class ClassicalBackbone:
         self, views: list[FrameTracks], frames: NDArray[np.int64], K: Array
     ) -> tuple[Reconstruction | None, tuple[str, ...]]:
         """Reconstruct context and window; without the context where that fails."""
-        unit = views[0].grey.shape[1] / 1280
         is_window = np.array([view.frame >= frames[0] for view in views])
         for is_used in (np.ones(len(views), bool), is_window):
             used = [view for view, keep in zip(views, is_used, strict=True) if keep]
-            solver = Solver(used, K, unit)
+            solver = Solver(used, K)
             if not self._start(solver, used):
                 continue
             solver.grow()
-            blurred = [cv2.GaussianBlur(v.grey.astype(np.float32), (0, 0), BLUR_PX) for v in used]
-            solution = solver.finish(np.stack(blurred), self._config.refine_radius)
-            share = solution.has_pose[-len(frames) :].mean()
-            if share > 0.5 and len(solution.bundle.points) >= 40:
+            solution = solver.finish(self._config.refine_radius)
+            if solution is not None and solution.has_pose[-len(frames) :].mean() > 0.5:
                 self._remember(used, solution)
                 return solution, ()
         self._poses = {}
@@ -172,7 +173,7 @@ class ClassicalBackbone:
         window = views[-len(frames) :]
         height, width = window[0].grey.shape
         pixel = width / 640
-        motions = [measure_motion(a, b, K) for a, b in zip(window[:-1], window[1:], strict=True)]
+        motions = [measure_motion(a, b, K) for a, b in pairwise(window)]
         poses = np.tile(np.eye(4), (len(frames), 1, 1))
         status = WindowStatus.FAILED
         if all(motion.num_matches >= 30 for motion in motions):
@@ -191,9 +192,3 @@ class ClassicalBackbone:
             np.tile(depth_K, (len(frames), 1, 1)),
             status,
         )
-
-
-def guess_intrinsics(height: int, width: int) -> Array:
-    """Return the intrinsics of a common camera, for images of which nothing is known."""
-    focal = DEFAULT_FOCAL * width
-    return intrinsics_matrix(focal, focal, (width - 1) / 2, (height - 1) / 2)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -18,6 +20,10 @@ MIN_VIEWS = 3
 MIN_POINTS = 40  # fewer do not hold a camera
 MIN_ANGLE = 0.004  # radians between the rays of a point
 PNP_ERROR_PX = 5.0  # at full width of 1280
+COARSE_ROUNDS = ((2.0, 6.0), (2.0, 3.0))  # Huber and limit, in pixels at full width of 1280
+FINE_ROUNDS = ((1.0, 3.0), (0.7, 1.5), (0.5, 1.5))
+ITERATIONS = 15
+BLUR_PX = 0.7  # of the images whose patches are aligned
 LOCAL_ADJUSTMENTS = {1, 3, 6, 10, 14}  # frames after the start at which the window is adjusted
 
 
@@ -101,10 +107,10 @@ def triangulate(rotations, translations, has_pose, cameras, starts, pixels, intr
 class Solver:
     """Grow a reconstruction of one window from its tracks."""
 
-    def __init__(self, views: list[FrameTracks], intrinsics: Array, scale_px: float) -> None:
+    def __init__(self, views: list[FrameTracks], intrinsics: Array) -> None:
         self._views = views
         self._K = intrinsics
-        self._unit = scale_px  # image width over 1280: thresholds are in pixels at that width
+        self._unit = views[0].grey.shape[1] / 1280  # thresholds are in pixels at that width
         self._flat = np.array(
             [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2], 0.0, 0.0]
         )
@@ -206,21 +212,42 @@ class Solver:
             bundle.is_fixed = bundle.is_fixed.copy()
             bundle.is_fixed[np.flatnonzero(self.has_pose)[0]] = True
 
-    def finish(self, images: NDArray[np.float32] | None = None, radius: int = 4) -> Reconstruction:
-        """Adjust in rounds, each with less tolerance; measure the tracks again in between."""
+    def finish(self, refine_radius: int = 0) -> Reconstruction | None:
+        """Adjust in rounds, each with less tolerance; measure the tracks again in between.
+
+        Args:
+            refine_radius: half side in pixels of the patches that are aligned at full
+                resolution; 0: the tracks stay as they are.
+
+        Returns:
+            What is left; None: too little to be a reconstruction.
+        """
+        if self.has_pose.sum() < MIN_VIEWS:
+            return None
         bundle, ids = self.bundle(8.0)
         self._anchor(bundle)
-        rounds = [(2.0, 6.0), (2.0, 3.0)]
-        for huber, limit in rounds:
-            bundle.adjust(huber * self._unit, 15)
-            kept = bundle.select(bundle.residuals() < limit * self._unit, MIN_VIEWS)
-            ids = ids[kept]
-        if images is not None:
-            kept = bundle.select(refine(bundle, images, radius), MIN_VIEWS)
-            ids = ids[kept]
-        for huber, limit in ((1.0, 3.0), (0.7, 1.5), (0.5, 1.5)):
-            bundle.adjust(huber * self._unit, 15)
-            kept = bundle.select(bundle.residuals() < limit * self._unit, MIN_VIEWS)
-            ids = ids[kept]
+        ids = self._settle(bundle, ids, COARSE_ROUNDS)
+        if refine_radius:
+            greys = [view.grey.astype(np.float32) for view in self._views]
+            blurred = np.stack([cv2.GaussianBlur(grey, (0, 0), BLUR_PX) for grey in greys])
+            ids = ids[bundle.select(refine(bundle, blurred, refine_radius), MIN_VIEWS)]
+            ids = self._settle(bundle, ids, FINE_ROUNDS)
+        if len(bundle.points) < MIN_POINTS:
+            return None
         return Reconstruction(self.rotations, self.translations, self.has_pose, bundle, ids)
 
+    def mean_squared_error(self, bundle: Bundle, limit_px: float) -> float:
+        """Return the mean over all observations, errors capped and lost ones at the limit."""
+        limit = limit_px * self._unit
+        kept = np.minimum(bundle.residuals(), limit) ** 2
+        num = len(self._all.cameras)
+        return float(kept.sum() + (num - len(kept)) * limit**2) / num
+
+    def _settle(
+        self, bundle: Bundle, ids: NDArray[np.int64], rounds: Iterable[tuple[float, float]]
+    ) -> NDArray[np.int64]:
+        """Adjust and drop what errs too much; (Huber, limit) in pixels each round."""
+        for huber, limit in rounds:
+            bundle.adjust(huber * self._unit, ITERATIONS)
+            ids = ids[bundle.select(bundle.residuals() < limit * self._unit, MIN_VIEWS)]
+        return ids

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from laser_slam.config import ClassicalConfig
 
 Grey = NDArray[np.uint8]
+Points = NDArray[np.float32]
 GRID = (2, 4)  # cells, rows by columns, that get an equal share of the corners
 MIN_DISTANCE_PX = 8  # between corners, at tracking width
 PYRAMID_LEVELS = 4
@@ -74,23 +76,30 @@ class Tracker:
 
     def _follow(self, previous: Grey, current: Grey) -> None:
         start = self._points
-        options = {
-            "winSize": (self._config.track_patch, self._config.track_patch),
-            "maxLevel": PYRAMID_LEVELS,
-            "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
-        }
-        guess = start + self._velocity
-        end, found, _ = cv2.calcOpticalFlowPyrLK(previous, current, start, guess.copy(), **options)
-        back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-            current, previous, end, start.copy(), **options
-        )
+        end, found = self._flow(previous, current, start, start + self._velocity)
+        back, found_back = self._flow(current, previous, end, start)
         gap = np.linalg.norm(back - start, axis=1)
         bounds = np.array([current.shape[1], current.shape[0]]) - 3
         inside = np.all((end > 2) & (end < bounds), axis=1)
-        is_kept = (found.ravel() == 1) & (found_back.ravel() == 1) & inside
+        is_kept = found & found_back & inside
         is_kept &= gap < self._config.max_backward_px
         self._velocity = (end - start)[is_kept]
         self._points, self._ids = end[is_kept], self._ids[is_kept]
+
+    def _flow(
+        self, first: Grey, second: Grey, points: Points, guess: Points
+    ) -> tuple[Points, NDArray[np.bool_]]:
+        patch = (self._config.track_patch, self._config.track_patch)
+        end, found, _ = cv2.calcOpticalFlowPyrLK(
+            first,
+            second,
+            points,
+            np.array(guess),
+            winSize=patch,
+            maxLevel=PYRAMID_LEVELS,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )
+        return end, found.ravel() == 1
 
     def _refill(self, small: Grey) -> None:
         mask = np.full(small.shape, 255, np.uint8)
@@ -101,8 +110,8 @@ class Tracker:
         columns = np.linspace(0, small.shape[1], GRID[1] + 1).astype(int)
         cells = [
             _corners(small, mask, (top, bottom, left, right), share, self._points)
-            for top, bottom in zip(rows[:-1], rows[1:], strict=True)
-            for left, right in zip(columns[:-1], columns[1:], strict=True)
+            for top, bottom in pairwise(rows)
+            for left, right in pairwise(columns)
         ]
         new = np.concatenate(cells).astype(np.float32)
         self._points = np.concatenate([self._points, new])
@@ -112,13 +121,13 @@ class Tracker:
         )
         self._next_id += len(new)
 
-    def _guess_velocity(self, new: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _guess_velocity(self, new: Points) -> Points:
         """Start new corners with the motion of the nearest old one."""
         if not len(self._velocity):
             return np.zeros_like(new)
         old = self._points[: len(self._velocity)]
         squared = ((new[:, None] - old[None]) ** 2).sum(axis=2)
-        return self._velocity[squared.argmin(axis=1)]
+        return np.asarray(self._velocity[squared.argmin(axis=1)])
 
 
 def _corners(
@@ -126,8 +135,8 @@ def _corners(
     mask: Grey,
     cell: tuple[int, int, int, int],
     share: int,
-    points: NDArray[np.float32],
-) -> NDArray[np.float32]:
+    points: Points,
+) -> Points:
     """Find the corners that a cell (top, bottom, left, right) lacks of its share."""
     top, bottom, left, right = cell
     inside = (points[:, 0] >= left) & (points[:, 0] < right)
@@ -145,4 +154,4 @@ def _corners(
     )
     if found is None:
         return np.zeros((0, 2), np.float32)
-    return np.asarray(found.reshape(-1, 2) + np.float32([left, top]), np.float32)
+    return np.asarray(found.reshape(-1, 2) + np.array([left, top]), np.float32)

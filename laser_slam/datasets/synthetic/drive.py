@@ -35,10 +35,11 @@ class SyntheticDrive:
     Args:
         config: size, seed, noise, haze; ``num_frames`` and ``step_m`` of the generated loop.
         world_from_cam: (N, 4, 4) another path, metres, 1.65 m above its road; None: a loop.
+            Where it comes by twice at two heights, it is levelled: ``info.truth`` has the result.
         name: of the sequence.
 
     Raises:
-        DatasetError: the path is no path, or crosses itself at two heights.
+        DatasetError: the path is no path, or crosses itself on a bridge.
         DependencyError: Open3D cannot be loaded.
     """
 
@@ -53,13 +54,13 @@ class SyntheticDrive:
         else:
             path = path_from_kitti_poses(world_from_cam)
         self._config = config
-        self._world_from_cam = path
         size = (config.height, config.width)
         focal = config.focal * config.width
         intrinsics = intrinsics_matrix(
             focal, focal, (config.width - 1) / 2, (config.height - 1) / 2
         )
         world = build_world(path, config.seed, config.haze)
+        self._world_from_cam = path = world.world_from_cam
         self._renderer = Renderer(world, intrinsics, size)
         frames = np.arange(len(path), dtype=np.int64)
         self._info = SequenceInfo(
