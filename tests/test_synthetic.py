@@ -185,9 +185,23 @@ def test_a_path_over_a_bridge_is_refused() -> None:
     angle = np.linspace(0, 2.4 * np.pi, num)
     poses = np.tile(np.eye(4), (num, 1, 1))
     poses[:, 0, 3], poses[:, 2, 3] = 30 - 30 * np.cos(angle), 30 * np.sin(angle)
-    poses[:, 1, 3] = np.linspace(0, 8, num)
-    with pytest.raises(DatasetError, match=r"lower at frame .*shorten it"):
+    poses[:, 1, 3] = np.linspace(0, 16, num)
+    with pytest.raises(DatasetError, match=r"passes the place of frame .*shorten the path"):
         SyntheticDrive(SyntheticConfig(width=96, height=32), poses)
+
+
+def test_a_drifting_height_is_levelled_where_the_path_comes_by_again() -> None:
+    num = 120
+    angle = np.linspace(0, 2.4 * np.pi, num)
+    poses = np.tile(np.eye(4), (num, 1, 1))
+    poses[:, 0, 3], poses[:, 2, 3] = 30 - 30 * np.cos(angle), 30 * np.sin(angle)
+    poses[:, 1, 3] = np.linspace(0, 4, num)
+    drive = SyntheticDrive(SyntheticConfig(width=96, height=32), poses)
+    rendered = poses_of(drive)
+    assert np.array_equal(rendered[:, [0, 2], 3], poses[:, [0, 2], 3])
+    assert abs(rendered[5, 1, 3] - rendered[105, 1, 3]) < 1.2  # 3.4 m as given
+    for frame in (5, 60, 105):
+        assert 4.0 < drive.true_depth(frame)[-1, 48] < 9.0
 
 
 @pytest.mark.parametrize(

@@ -50,6 +50,7 @@ class HouseSize:
     depth: float
     storeys: int
     roof: str  # "along", "across", "hip" or "flat"
+    has_bay: bool = False  # a bay window, 1.1 m deep, in front of the front
 
     @property
     def height(self) -> float:
@@ -223,12 +224,12 @@ def _add_extras(
     if size.roof != "flat":
         low, high = np.array([x - 0.35, size.height - 1, z - 0.35]), np.array([x + 0.35, top, z])
         _add_block(builder, place, (low, high), WALL_COLORS[BRICK][int(rng.integers(3))], BRICK)
-    if rng.random() < 0.3 and size.width > 8:
+    if size.has_bay:
         x = float(rng.choice([-0.28, 0.28])) * size.width
         bay = HouseSize(2.6, 1.2, 1, "flat")
         forward = Placement(place.world(np.array([x, 0.0, 1.1])), place.yaw)
         walls = box(np.array([-1.3, 0.0, -1.1]), np.array([1.3, bay.height, 0.0]))
-        look = (colors[0], colors[0], (1.0, 1.3, 3.0, 1.0), int(rng.integers(1 << 30)))
+        look = (colors[0], colors[0], (1.0, 2.6, 3.0, 1.0), int(rng.integers(1 << 30)))
         for corner, along, _ in walls[:4]:
             wall = _wall(forward, corner, along, bay.height, look)
             _add_rectangle(builder, wall, -BURIED_M, bay.height)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
@@ -109,7 +111,8 @@ class Layout:
             middle = min(int(at + size.width / 2), len(rows) - 1)
             place = self._place(rows[middle], side * setback)
             if self._take_house(place, size):
-                houses.add_house(self._builder, place, size, rng)
+                has_bay = setback > EDGE_M + 2.0 and size.width > 8 and rng.random() < 0.5
+                houses.add_house(self._builder, place, replace(size, has_bay=has_bay), rng)
                 self._add_garden(rows[middle], side, setback, size.width, rng)
                 gap = 0.3 if rng.random() < 0.35 else float(rng.uniform(2.0, 7.0))
                 at += size.width + gap

@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 MARGIN_M = 130.0  # ground beyond the streets; haze and trees hide its end
 CELL_M = 2.0
 KERB_M = 0.12
+HEIGHT_TOLERANCE_M = 0.4
+MAX_LEVELLING_M = 4.0
 
 
 @dataclass(frozen=True)
@@ -55,10 +57,9 @@ class Terrain:
 
 
 def make_terrain(world_from_cam: Array, streets: Streets, seed: int) -> Terrain:
-    """Draw the ground so that all cameras are 1.65 m above it, with low hills far from streets.
+    """Draw the ground 1.65 m below the cameras, with low hills far from streets.
 
-    Raises:
-        DatasetError: the path crosses itself at two heights (a bridge), which one ground cannot.
+    Where the path comes by twice at different heights, the ground lies between.
     """
     cameras = world_from_cam[:, [0, 2], 3]
     everything = np.concatenate([streets.points, cameras])
@@ -73,15 +74,27 @@ def make_terrain(world_from_cam: Array, streets: Streets, seed: int) -> Terrain:
     distance = np.asarray(distance_transform_edt(is_street)) * CELL_M
     waves = cv2.GaussianBlur(np.random.default_rng((seed, 3)).standard_normal(shape), (0, 0), 9.0)
     waves *= np.clip((distance - 20.0) * 0.03, 0.0, 1.5) / max(float(waves.std()), 1e-9)
-    terrain = Terrain(ground + waves, distance, origin)
-    clearance = terrain.at(cameras) - world_from_cam[:, 1, 3]
-    if clearance.min() < 0.6:
-        frame = int(np.argmin(clearance))
+    return Terrain(ground + waves, distance, origin)
+
+
+def level_path(world_from_cam: Array, terrain: Terrain) -> Array:
+    """Lift or lower the cameras that are not 1.65 m above the ground, give or take 0.4 m.
+
+    Satellite heights drift: the second passage of a place may be given metres above the first.
+
+    Raises:
+        DatasetError: a camera is so far off that the path must cross itself on a bridge.
+    """
+    too_high = terrain.at(world_from_cam[:, [0, 2], 3]) - world_from_cam[:, 1, 3] - CAMERA_HEIGHT_M
+    frame = int(np.argmax(np.abs(too_high)))
+    if abs(too_high[frame]) > MAX_LEVELLING_M:
         raise DatasetError(
-            f"the camera path is {CAMERA_HEIGHT_M - clearance[frame]:.1f} m lower at frame {frame} "
-            "than at another passage of the same place; one ground cannot hold both: shorten it"
+            f"the camera path passes the place of frame {frame} at heights that differ by "
+            f"{2 * abs(too_high[frame]):.0f} m; one ground cannot hold a bridge: shorten the path"
         )
-    return terrain
+    out = world_from_cam.copy()
+    out[:, 1, 3] += np.sign(too_high) * np.maximum(np.abs(too_high) - HEIGHT_TOLERANCE_M, 0.0)
+    return out
 
 
 def _interpolated(shape: tuple[int, int], cells: Array, values: Array) -> Array:

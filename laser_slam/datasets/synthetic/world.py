@@ -15,6 +15,7 @@ from laser_slam.datasets.synthetic.terrain import (
     Terrain,
     add_ground,
     add_pavements,
+    level_path,
     make_terrain,
 )
 from laser_slam.datasets.synthetic.textures import Textures, make_textures
@@ -56,10 +57,17 @@ class Scene(NamedTuple):
 
 @dataclass(frozen=True)
 class World:
-    """A built world: ``raycaster`` is Open3D's scene of the mesh that ``scene`` describes."""
+    """A built world.
+
+    Attributes:
+        raycaster: Open3D's scene of the mesh.
+        scene: what the mesh looks like.
+        world_from_cam: (N, 4, 4) the path, levelled where it comes by twice at two heights.
+    """
 
     raycaster: Any
     scene: Scene
+    world_from_cam: Array
 
 
 def build_world(world_from_cam: Array, seed: int, haze: float) -> World:
@@ -71,7 +79,7 @@ def build_world(world_from_cam: Array, seed: int, haze: float) -> World:
         haze: extinction per metre.
 
     Raises:
-        DatasetError: the path crosses itself at two heights.
+        DatasetError: the path crosses itself on a bridge.
         DependencyError: Open3D cannot be loaded.
     """
     streets = make_streets(world_from_cam)
@@ -97,7 +105,7 @@ def build_world(world_from_cam: Array, seed: int, haze: float) -> World:
         sun=sun,
         haze=haze,
     )
-    return World(raycaster, scene)
+    return World(raycaster, scene, level_path(world_from_cam, terrain))
 
 
 def _raycaster(mesh: Mesh) -> Any:
