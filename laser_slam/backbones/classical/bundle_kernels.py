@@ -116,7 +116,7 @@ def _invert3(a, damping, out):
 
 
 @njit(cache=True, nogil=True)
-def _normal_equations(
+def normal_equations(
     rotations, translations, points, cameras, starts, pixels, intrinsics, huber, H, g, W, V, b
 ):
     """Accumulate camera blocks H (6C, 6C), g (6C), cross blocks W (M, 6, 3), points V (P, 3, 3), b."""
@@ -148,7 +148,7 @@ def _normal_equations(
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _eliminate_points(cameras, starts, W, V, b, damping, S, s, V_inv):
+def eliminate_points(cameras, starts, W, V, b, damping, S, s, V_inv):
     """Subtract the points' part: S -= W V^-1 W^T, s -= W V^-1 b (lower blocks only)."""
     Y = np.zeros((6, 3))
     for point in range(V.shape[0]):
@@ -246,7 +246,7 @@ def levenberg_marquardt(
         H, g = np.zeros((6 * num_cams, 6 * num_cams)), np.zeros(6 * num_cams)
         W = np.zeros((cameras.shape[0], 6, 3))
         V, b = np.zeros((points.shape[0], 3, 3)), np.zeros((points.shape[0], 3))
-        _normal_equations(
+        normal_equations(
             rotations,
             translations,
             points,
@@ -264,7 +264,7 @@ def levenberg_marquardt(
         improved = False
         for _ in range(TRIALS):
             S, s, V_inv = H.copy(), g.copy(), np.zeros_like(V)
-            _eliminate_points(cameras, starts, W, V, b, damping, S, s, V_inv)
+            eliminate_points(cameras, starts, W, V, b, damping, S, s, V_inv)
             for c in range(num_cams):
                 for i in range(6 * c, 6 * c + 6):
                     S[i, i] += damping * H[i, i] + 1e-9

@@ -25,7 +25,8 @@ from laser_slam.config import ClassicalConfig
 from laser_slam.sim3 import Array, rotation_log
 from laser_slam.types import Calibration, Window
 
-ROUNDS = 5
+ROUNDS = 8
+SETTLED = 2e-4  # step of relative focal length, k1 and k2 at which it stops
 HUBER_PX = 0.5  # at full width of 1280, as all pixels here
 NOISE_PX = 1.5  # of a track, as if tracks were independent: five times what one measures
 # Standard deviations of what is assumed before: relative focal length, k1, k2.
@@ -191,9 +192,12 @@ def _optimise(
         costs.append(sum(term[2] for term in terms) + float(state @ precision @ state))
         H = precision + sum(term[0] for term in terms)
         g = -precision @ state + sum(term[1] for term in terms)
-        state = state + np.linalg.solve(H, g)
+        step = np.linalg.solve(H, g)
+        state = state + step
         if not np.isfinite(state).all() or np.abs(state).max() > MAX_DISTORTION:
             return None
+        if np.abs(step).max() < SETTLED:
+            break
     return state if costs[-1] <= costs[0] else None
 
 
@@ -207,7 +211,7 @@ def _with(given: Array, state: Array) -> Array:
 
 def _reduced(bundle: Bundle, huber_px: float) -> tuple[Array, Array]:
     """Return (3, 3) and (3,) normal equations of the calibration, all else eliminated."""
-    H, g = shared_equations(
+    S, cross, H, s, g = shared_equations(
         bundle.rotations,
         bundle.translations,
         bundle.points,
@@ -217,11 +221,10 @@ def _reduced(bundle: Bundle, huber_px: float) -> tuple[Array, Array]:
         bundle.intrinsics,
         huber_px,
     )
-    free = np.repeat(~bundle.is_fixed, 6)
-    cameras = np.flatnonzero(free)
-    shared = np.arange(len(free), len(g))
-    A = H[np.ix_(cameras, cameras)]
+    free = np.flatnonzero(np.repeat(~bundle.is_fixed, 6))
+    A = np.tril(S[np.ix_(free, free)])
+    A = A + np.tril(A, -1).T
     A[np.diag_indices(len(A))] += 1e-6 * np.diag(A) + 1e-9  # the scale of a window is free
-    B = H[np.ix_(cameras, shared)]
-    X = np.linalg.solve(A, np.column_stack([B, g[cameras]]))
-    return H[np.ix_(shared, shared)] - B.T @ X[:, :-1], g[shared] - B.T @ X[:, -1]
+    B = cross[free]
+    X = np.linalg.solve(A, np.column_stack([B, s[free]]))
+    return H - B.T @ X[:, :-1], g - B.T @ X[:, -1]
