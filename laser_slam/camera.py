@@ -32,9 +32,15 @@ def intrinsics_from_fov(fov_deg: float, height: int, width: int) -> Array:
     )
 
 
-def guess_intrinsics(height: int, width: int) -> Array:
-    """Return the intrinsics of a common camera, for images of which nothing is known."""
-    focal = COMMON_FOCAL * width
+def guess_intrinsics(height: int, width: int, relative_focal: float = COMMON_FOCAL) -> Array:
+    """Return the intrinsics of a common camera, for images of which nothing is known.
+
+    Args:
+        height: image height in pixels.
+        width: image width in pixels.
+        relative_focal: focal length in image widths, where that is known.
+    """
+    focal = relative_focal * width
     return intrinsics_matrix(focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
@@ -76,12 +82,12 @@ def project(points: Array, intrinsics: Array) -> Array:
     return np.stack([u, v], axis=-1)
 
 
-def distort(rays: Array, distortion: Array) -> Array:
-    """Apply radial distortion to (..., 2) ray slopes x / z, y / z.
+def distort(slopes: Array, distortion: Array) -> Array:
+    """Return the slopes at which a lens with radial distortion shows rays.
 
     Args:
-        rays: (..., 2).
+        slopes: (..., 2) x / z and y / z of the rays.
         distortion: (2,) k1, k2 as OpenCV defines them.
     """
-    r2 = (rays**2).sum(axis=-1, keepdims=True)
-    return np.asarray(rays * (1 + r2 * (distortion[0] + r2 * distortion[1])))
+    r2 = (slopes**2).sum(axis=-1, keepdims=True)
+    return np.asarray(slopes * (1 + r2 * (distortion[0] + r2 * distortion[1])))

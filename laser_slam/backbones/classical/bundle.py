@@ -1,4 +1,4 @@
-"""Bundle adjustment of one window: poses and points by Levenberg-Marquardt on the Schur complement."""
+"""Bundle adjustment of one window: Levenberg-Marquardt on poses, points eliminated (Schur)."""
 
 from __future__ import annotations
 

@@ -6,9 +6,6 @@ and pixels (M, 2) of the observations, sorted by point, starts (P + 1,) first ob
 point, intrinsics (6,) fx, fy, cx, cy, k1, k2.
 """
 
-# ruff: noqa: PLR0913, C901  (a kernel inlines what would cost a call per pixel)
-# mypy: disable-error-code="no-untyped-def"
-
 from __future__ import annotations
 
 import numpy as np
@@ -30,6 +27,7 @@ def distorted(x, y, intrinsics):
 
 @njit(cache=True, nogil=True)
 def residual_norms(rotations, translations, points, cameras, starts, pixels, intrinsics, out):
+    """Fill (M,) lengths of the residuals in pixels; infinite behind the camera."""
     for point in range(points.shape[0]):
         for o in range(starts[point], starts[point + 1]):
             c = cameras[o]
@@ -77,20 +75,15 @@ def linearise(R, t, point, pixel, intrinsics, huber, J_cam, J_point, residual):
     w = 1.0 if e <= huber else np.sqrt(huber / e)
     residual[0], residual[1] = w * du, w * dv
     r2 = xn * xn + yn * yn
-    radial, slope = (
-        1 + r2 * (intrinsics[4] + r2 * intrinsics[5]),
-        intrinsics[4] + 2 * r2 * intrinsics[5],
-    )
+    radial = 1 + r2 * (intrinsics[4] + r2 * intrinsics[5])
+    slope = intrinsics[4] + 2 * r2 * intrinsics[5]  # of the radial factor over r2
     fx, fy = w * intrinsics[0] / z, w * intrinsics[1] / z
     ux, uy = fx * (radial + 2 * slope * xn * xn), fx * 2 * slope * xn * yn
     vx, vy = fy * 2 * slope * xn * yn, fy * (radial + 2 * slope * yn * yn)
     uz, vz = -(ux * xn + uy * yn), -(vx * xn + vy * yn)
     for i, (gx, gy, gz) in enumerate(((ux, uy, uz), (vx, vy, vz))):
-        J_cam[i, 0], J_cam[i, 1], J_cam[i, 2] = (
-            gz * ry - gy * rz,
-            gx * rz - gz * rx,
-            gy * rx - gx * ry,
-        )
+        J_cam[i, 0], J_cam[i, 1] = gz * ry - gy * rz, gx * rz - gz * rx
+        J_cam[i, 2] = gy * rx - gx * ry
         J_cam[i, 3], J_cam[i, 4], J_cam[i, 5] = gx, gy, gz
         for k in range(3):
             J_point[i, k] = gx * R[0, k] + gy * R[1, k] + gz * R[2, k]
@@ -102,14 +95,15 @@ def _invert3(a, damping, out):
     d0 = a[0, 0] * (1 + damping) + 1e-12
     d1 = a[1, 1] * (1 + damping) + 1e-12
     d2 = a[2, 2] * (1 + damping) + 1e-12
-    c00, c01, c02 = d1 * d2 - a[1, 2] ** 2, a[0, 2] * a[1, 2] - a[0, 1] * d2, 0.0
+    c00, c01 = d1 * d2 - a[1, 2] ** 2, a[0, 2] * a[1, 2] - a[0, 1] * d2
     c02 = a[0, 1] * a[1, 2] - a[0, 2] * d1
-    inv = 1.0 / (d0 * c00 + a[0, 1] * c01 + a[0, 2] * c02)
-    out[0, 0], out[1, 1], out[2, 2] = (
-        c00 * inv,
-        (d0 * d2 - a[0, 2] ** 2) * inv,
-        (d0 * d1 - a[0, 1] ** 2) * inv,
-    )
+    det = d0 * c00 + a[0, 1] * c01 + a[0, 2] * c02
+    if not det > 0:  # its rays are parallel: the point stays where it is
+        out[:] = 0.0
+        return
+    inv = 1.0 / det
+    out[0, 0], out[1, 1] = c00 * inv, (d0 * d2 - a[0, 2] ** 2) * inv
+    out[2, 2] = (d0 * d1 - a[0, 1] ** 2) * inv
     out[0, 1] = out[1, 0] = c01 * inv
     out[0, 2] = out[2, 0] = c02 * inv
     out[1, 2] = out[2, 1] = (a[0, 1] * a[0, 2] - d0 * a[1, 2]) * inv
@@ -119,22 +113,16 @@ def _invert3(a, damping, out):
 def normal_equations(
     rotations, translations, points, cameras, starts, pixels, intrinsics, huber, H, g, W, V, b
 ):
-    """Accumulate camera blocks H (6C, 6C), g (6C), cross blocks W (M, 6, 3), points V (P, 3, 3), b."""
+    """Add up the cameras' H (6C, 6C), g (6C,), the points' V (P, 3, 3), b (P, 3), and fill W.
+
+    W (M, 6, 3) holds the cross blocks, one for each observation.
+    """
     J_cam, J_point, r = np.zeros((2, 6)), np.zeros((2, 3)), np.zeros(2)
     for point in range(points.shape[0]):
         for o in range(starts[point], starts[point + 1]):
             c = cameras[o]
-            linearise(
-                rotations[c],
-                translations[c],
-                points[point],
-                pixels[o],
-                intrinsics,
-                huber,
-                J_cam,
-                J_point,
-                r,
-            )
+            R, t = rotations[c], translations[c]
+            linearise(R, t, points[point], pixels[o], intrinsics, huber, J_cam, J_point, r)
             for i in range(3):
                 b[point, i] -= J_point[0, i] * r[0] + J_point[1, i] * r[1]
                 for j in range(3):
@@ -227,6 +215,21 @@ def _move(rotations, translations, points, step, starts, cameras, W, V_inv, b):
 
 
 @njit(cache=True, nogil=True)
+def _camera_step(H, g, W, V, b, cameras, starts, is_fixed, damping):
+    """Return whether the damped equations could be solved, the (6C,) step, and V^-1."""
+    S, s, V_inv = H.copy(), g.copy(), np.zeros_like(V)
+    eliminate_points(cameras, starts, W, V, b, damping, S, s, V_inv)
+    for i in range(S.shape[0]):
+        S[i, i] += damping * H[i, i] + 1e-9
+        if is_fixed[i // 6]:
+            S[i, :] = 0.0
+            S[:, i] = 0.0
+            S[i, i] = 1.0
+            s[i] = 0.0
+    return _solve_cholesky(S, s), s, V_inv
+
+
+@njit(cache=True, nogil=True)
 def levenberg_marquardt(
     rotations,
     translations,
@@ -239,6 +242,7 @@ def levenberg_marquardt(
     huber,
     iterations,
 ):
+    """Minimise the Huber cost, poses and points in place; return the cost, which never rises."""
     num_cams = rotations.shape[0]
     damping = 1e-4
     cost = _cost(rotations, translations, points, cameras, starts, pixels, intrinsics, huber)
@@ -263,19 +267,10 @@ def levenberg_marquardt(
         )
         improved = False
         for _ in range(TRIALS):
-            S, s, V_inv = H.copy(), g.copy(), np.zeros_like(V)
-            eliminate_points(cameras, starts, W, V, b, damping, S, s, V_inv)
-            for c in range(num_cams):
-                for i in range(6 * c, 6 * c + 6):
-                    S[i, i] += damping * H[i, i] + 1e-9
-                    if is_fixed[c]:
-                        S[i, :] = 0.0
-                        S[:, i] = 0.0
-                        S[i, i] = 1.0
-                        s[i] = 0.0
-            if _solve_cholesky(S, s):
+            is_solved, step, V_inv = _camera_step(H, g, W, V, b, cameras, starts, is_fixed, damping)
+            if is_solved:
                 new_R, new_t, new_points = _move(
-                    rotations, translations, points, s, starts, cameras, W, V_inv, b
+                    rotations, translations, points, step, starts, cameras, W, V_inv, b
                 )
                 new_cost = _cost(
                     new_R, new_t, new_points, cameras, starts, pixels, intrinsics, huber

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import cv2
@@ -17,11 +18,12 @@ import numpy as np
 
 from laser_slam.backbones.classical.bundle import Bundle
 from laser_slam.backbones.classical.calibration_kernels import shared_equations
-from laser_slam.backbones.classical.reconstruction import Solver
+from laser_slam.backbones.classical.reconstruction import Reconstruction, Solver
 from laser_slam.backbones.classical.tracking import FrameTracks, Tracker
 from laser_slam.backbones.classical.twoview import measure_motion
-from laser_slam.camera import guess_intrinsics
+from laser_slam.camera import COMMON_FOCAL, guess_intrinsics
 from laser_slam.config import ClassicalConfig
+from laser_slam.errors import DegenerateGeometryError
 from laser_slam.sim3 import Array, rotation_log
 from laser_slam.types import Calibration, Window
 
@@ -33,13 +35,13 @@ NOISE_PX = 1.5  # of a track, as if tracks were independent: five times what one
 KNOWN_PRIOR = (0.02, 0.1, 0.1)
 SCANNED_PRIOR = (0.05, 0.1, 0.1)
 GUESSED_PRIOR = (0.002, 0.1, 0.1)
-FOCALS = np.geomspace(0.42, 1.3, 7)  # in image widths
+FOCALS = np.geomspace(0.42, 1.3, 7).tolist()  # in image widths
 LOST_PX = 1.5  # error that a lost observation counts as
 MIN_CONTRAST = 0.1  # of the cost over the focals; below it, nothing is learnt
 NUM_SCANNED = 3  # windows, those that turn most
 MIN_TURN_DEG = 10.0  # of a window that tells the focal length
 MIN_BUNDLES = 2
-MAX_DISTORTION = 0.5
+MAX_STATE = 0.5  # of relative focal length, k1, k2; beyond it, the equations have run away
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,21 @@ class _Clip:
 
     views: list[FrameTracks]
     turn_deg: float
+
+
+@dataclass(frozen=True)
+class _Start:
+    """What is assumed before the windows are adjusted.
+
+    Attributes:
+        intrinsics: (3, 3) in pixels.
+        sigmas: of its relative focal length, and of k1 and k2 around zero.
+        source: where it comes from, in words.
+    """
+
+    intrinsics: Array
+    sigmas: tuple[float, float, float]
+    source: str
 
 
 def calibrate(
@@ -59,7 +76,7 @@ def calibrate(
     """Measure how the camera projects.
 
     Args:
-        windows: some of the sequence, with images at the size that the backbone wants.
+        windows: some of the sequence, in order, with images at the size that the backbone wants.
         intrinsics: (3, 3) in pixels of these images, taken as good to 2 %; None: unknown.
         config: of the tracks.
         workers: threads.
@@ -67,32 +84,33 @@ def calibrate(
     Returns:
         The calibration at the size of the images. Where the clip does not tell, what was given, or
         a guess; ``source`` says so.
+
+    Raises:
+        DegenerateGeometryError: there is no window.
     """
-    clips, size = _track(windows, intrinsics, config)
-    if intrinsics is not None:
-        return _refine(clips, intrinsics, size, KNOWN_PRIOR, config, workers, "given")
-    guess, contrast = _scan_focal(clips, size, workers)
-    if contrast < MIN_CONTRAST:
-        source = f"guessed: the clip turns too little to tell (contrast {contrast:.2f})"
-        return _refine(clips, guess, size, GUESSED_PRIOR, config, workers, source)
-    source = f"estimated from the images (contrast {contrast:.2f})"
-    return _refine(clips, guess, size, SCANNED_PRIOR, config, workers, source)
+    clips = _track(windows, intrinsics, config)
+    if not clips:
+        raise DegenerateGeometryError("no window to calibrate the camera by")
+    known = None if intrinsics is None else _Start(intrinsics, KNOWN_PRIOR, "given")
+    return _refine(clips, known or _guess(clips, workers), config, workers)
 
 
 def _track(
     windows: Iterable[Window], intrinsics: Array | None, config: ClassicalConfig
-) -> tuple[list[_Clip], tuple[int, int]]:
-    tracker, clips, size = Tracker(config, memory=256), [], (0, 0)
+) -> list[_Clip]:
+    """Follow corners through all windows; a frame that windows share is tracked once."""
+    tracker, clips = Tracker(config, memory=1), []
+    seen: dict[int, FrameTracks] = {}
     for window in windows:
-        size = window.images[0].shape[:2]
-        known = {view.frame for view in tracker.history}
-        for frame, image in zip(window.frames, window.images, strict=True):
-            if int(frame) not in known:
-                tracker.add(int(frame), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-        views = [view for view in tracker.history if view.frame in window.frames]
-        K = guess_intrinsics(*size) if intrinsics is None else intrinsics
+        before, seen = seen, {}
+        for frame, image in zip(window.frames.tolist(), window.images, strict=True):
+            if frame not in before:
+                tracker.add(frame, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+            seen[frame] = before[frame] if frame in before else tracker.history[-1]
+        views = list(seen.values())
+        K = guess_intrinsics(*views[0].grey.shape) if intrinsics is None else intrinsics
         clips.append(_Clip(views, _turn_deg(views, K)))
-    return clips, size
+    return clips
 
 
 def _turn_deg(views: list[FrameTracks], K: Array) -> float:
@@ -102,81 +120,98 @@ def _turn_deg(views: list[FrameTracks], K: Array) -> float:
     return float(np.degrees(np.linalg.norm(rotation_log(rotation))))
 
 
-def _solve(clip: _Clip, K: Array, refine_radius: int) -> Bundle | None:
+def _solve(clip: _Clip, K: Array, refine_radius: int) -> tuple[Solver, Reconstruction | None]:
     solver = Solver(clip.views, K)
     if not solver.start_from_pair():
-        return None
+        return solver, None
     solver.grow()
-    solution = solver.finish(refine_radius)
-    return None if solution is None else solution.bundle
+    return solver, solver.finish(refine_radius)
 
 
-def _scan_focal(
-    clips: list[_Clip], size: tuple[int, int], workers: ThreadPoolExecutor
-) -> tuple[Array, float]:
-    """Try focal lengths on the windows that turn most; return the best, and its contrast."""
-    turning = sorted(clips, key=lambda clip: -clip.turn_deg)[:NUM_SCANNED]
+def _guess(clips: list[_Clip], workers: ThreadPoolExecutor) -> _Start:
+    """Find the focal length at which the windows that turn most fit best."""
+    height, width = clips[0].views[0].grey.shape
+    turning = sorted(clips, key=lambda clip: (-clip.turn_deg, clip.views[0].frame))[:NUM_SCANNED]
     turning = [clip for clip in turning if clip.turn_deg > MIN_TURN_DEG]
-    if not turning:
-        return guess_intrinsics(*size), 0.0
-    tried = dict(zip(FOCALS, workers.map(lambda f: _cost(turning, f, size), FOCALS), strict=True))
-    best = min(tried, key=lambda f: tried[f])
-    step = float(FOCALS[1] / FOCALS[0]) ** (1 / 3)
+    focal, contrast = _scan_focal(turning, workers) if turning else (COMMON_FOCAL, 0.0)
+    measured = f"(contrast {contrast:.2f})"
+    if contrast < MIN_CONTRAST:
+        guess = guess_intrinsics(height, width)
+        return _Start(
+            guess, GUESSED_PRIOR, f"guessed: the clip turns too little to tell {measured}"
+        )
+    source = f"estimated from the images {measured}"
+    if not FOCALS[0] <= focal <= FOCALS[-1]:
+        source += ", at the end of what was tried"
+    return _Start(guess_intrinsics(height, width, focal), SCANNED_PRIOR, source)
+
+
+def _scan_focal(clips: list[_Clip], workers: ThreadPoolExecutor) -> tuple[float, float]:
+    """Try focal lengths; return the best, in image widths, and its contrast to the others."""
+    cost = partial(_cost, clips)
+    tried = dict(zip(FOCALS, workers.map(cost, FOCALS), strict=True))
+    best = min(tried, key=lambda focal: tried[focal])
+    step = (FOCALS[1] / FOCALS[0]) ** (1 / 3)
     finer = [best / step**2, best / step, best * step, best * step**2]
-    tried |= dict(zip(finer, workers.map(lambda f: _cost(turning, f, size), finer), strict=True))
-    best = min(tried, key=lambda f: tried[f])
-    contrast = 1.0 - tried[best] / float(np.median(list(tried.values())))
-    K = guess_intrinsics(*size)
-    K[0, 0] = K[1, 1] = best * size[1]
-    return K, contrast
+    tried |= dict(zip(finer, workers.map(cost, finer), strict=True))
+    best = min(tried, key=lambda focal: tried[focal])
+    return best, 1.0 - tried[best] / float(np.median(list(tried.values())))
 
 
-def _cost(clips: list[_Clip], focal: float, size: tuple[int, int]) -> float:
+def _cost(clips: list[_Clip], focal: float) -> float:
     """Return the mean squared error of all observations, those that were lost at LOST_PX."""
-    K = guess_intrinsics(*size)
-    K[0, 0] = K[1, 1] = focal * size[1]
+    height, width = clips[0].views[0].grey.shape
+    lost = (LOST_PX * width / 1280) ** 2
     total = 0.0
     for clip in clips:
-        solver = Solver(clip.views, K)
-        solution = None
-        if solver.start_from_pair():
-            solver.grow()
-            solution = solver.finish()
-        total += (
-            LOST_PX**2 if solution is None else solver.mean_squared_error(solution.bundle, LOST_PX)
-        )
+        solver, solution = _solve(clip, guess_intrinsics(height, width, focal), 0)
+        total += solver.mean_squared_error(solution.bundle, LOST_PX) if solution else lost
     return total / len(clips)
 
 
-def _refine(  # noqa: PLR0913, PLR0917  (a step of its own, with all that it needs)
-    clips: list[_Clip],
-    K: Array,
-    size: tuple[int, int],
-    prior: tuple[float, float, float],
-    config: ClassicalConfig,
-    workers: ThreadPoolExecutor,
-    source: str,
+def _refine(
+    clips: list[_Clip], start: _Start, config: ClassicalConfig, workers: ThreadPoolExecutor
 ) -> Calibration:
-    solved = workers.map(lambda clip: _solve(clip, K, config.refine_radius), clips)
-    bundles = [bundle for bundle in solved if bundle is not None]
+    """Adjust all windows and the calibration together."""
+    height, width = clips[0].views[0].grey.shape
+    K, size = start.intrinsics, (height, width)
+    solved = workers.map(lambda clip: _solve(clip, K, config.refine_radius)[1], clips)
+    bundles = [solution.bundle for solution in solved if solution is not None]
     if len(bundles) < MIN_BUNDLES:
-        return Calibration(K, np.zeros(2), size, f"{source}, unrefined: too little moves")
-    unit = size[1] / 1280
-    found = _optimise(bundles, np.array(prior), unit, workers)
-    if found is None:
-        return Calibration(K, np.zeros(2), size, f"{source}, unrefined: the clip does not tell")
-    focal, k1, k2 = found
+        source = f"{start.source}, unrefined: too little moves"
+        return Calibration(K, np.zeros(2), size, source)
+    found = _optimise(bundles, np.array(start.sigmas), width / 1280, workers)
+    corner = np.abs([[0, 0], [width - 1, height - 1]] - K[:2, 2]).max(axis=0)
+    if found is None or _folds(found[1:], corner / K[[0, 1], [0, 1]]):
+        source = f"{start.source}, unrefined: the clip does not tell"
+        return Calibration(K, np.zeros(2), size, source)
     refined = K.copy()
-    refined[0, 0] *= 1 + focal
-    refined[1, 1] *= 1 + focal
-    words = f"{source}, refined on {len(bundles)} windows"
-    return Calibration(refined, np.array([k1, k2]), size, words)
+    refined[[0, 1], [0, 1]] *= 1 + found[0]
+    source = f"{start.source}, refined on {len(bundles)} windows"
+    return Calibration(refined, found[1:], size, source)
+
+
+def _folds(distortion: Array, corner: Array) -> bool:
+    """Tell whether the lens would show something twice before the corner, a (2,) ray slope."""
+    k1, k2 = distortion
+    r2 = np.linspace(0, float(corner @ corner), 50)
+    return bool((1 + r2 * (3 * k1 + r2 * 5 * k2)).min() <= 0)
 
 
 def _optimise(
     bundles: list[Bundle], prior: Array, unit: float, workers: ThreadPoolExecutor
 ) -> Array | None:
-    """Gauss-Newton on relative focal length, k1, k2, everything else adjusted in each round."""
+    """Gauss-Newton on relative focal length, k1, k2, everything else adjusted in each round.
+
+    Args:
+        bundles: windows; their poses and points are updated in place.
+        prior: (3,) standard deviations.
+        unit: pixels per pixel of an image 1280 wide.
+        workers: threads.
+
+    Returns:
+        (3,); None: it does not converge.
+    """
     given = bundles[0].intrinsics.copy()
     state = np.zeros(3)
     precision = np.diag((NOISE_PX * unit / prior) ** 2)
@@ -188,17 +223,22 @@ def _optimise(
 
     costs = []
     for _ in range(ROUNDS):
-        terms = list(workers.map(equations, bundles))
+        try:
+            terms = list(workers.map(equations, bundles))
+        except np.linalg.LinAlgError:
+            return None
         costs.append(sum(term[2] for term in terms) + float(state @ precision @ state))
         H = precision + sum(term[0] for term in terms)
         g = -precision @ state + sum(term[1] for term in terms)
-        step = np.linalg.solve(H, g)
+        if not (np.isfinite(H).all() and np.isfinite(g).all()):
+            return None
+        step = np.linalg.solve(H, g)  # the prior keeps it from being singular
         state = state + step
-        if not np.isfinite(state).all() or np.abs(state).max() > MAX_DISTORTION:
+        if np.abs(state).max() > MAX_STATE:
             return None
         if np.abs(step).max() < SETTLED:
-            break
-    return state if costs[-1] <= costs[0] else None
+            return state if costs[-1] <= costs[0] else None
+    return None
 
 
 def _with(given: Array, state: Array) -> Array:

@@ -1,13 +1,12 @@
 """Compiled part of self-calibration; arguments as in `bundle_kernels`."""
 
-# mypy: disable-error-code="no-untyped-def"
-
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
 from laser_slam.backbones.classical.bundle_kernels import (
+    MIN_DEPTH,
     distorted,
     eliminate_points,
     linearise,
@@ -45,7 +44,8 @@ def shared_equations(rotations, translations, points, cameras, starts, pixels, i
         rotations, translations, points, cameras, starts, pixels, intrinsics, huber, S, s, W, V, b
     )
     eliminate_points(cameras, starts, W, V, b, 0.0, S, s, V_inv)
-    cross, H, g = np.zeros((6 * num_cams, NUM_SHARED)), np.zeros((NUM_SHARED, NUM_SHARED)), np.zeros(NUM_SHARED)
+    H, g = np.zeros((NUM_SHARED, NUM_SHARED)), np.zeros(NUM_SHARED)
+    cross = np.zeros((6 * num_cams, NUM_SHARED))
     J_cam, J_point, r = np.zeros((2, 6)), np.zeros((2, 3)), np.zeros(2)
     J = np.zeros((2, NUM_SHARED))
     for point in range(num):
@@ -54,7 +54,8 @@ def shared_equations(rotations, translations, points, cameras, starts, pixels, i
             R, t = rotations[cameras[o]], translations[cameras[o]]
             X = R @ points[point] + t
             linearise(R, t, points[point], pixels[o], intrinsics, huber, J_cam, J_point, r)
-            _shared_jacobian(X[0] / X[2], X[1] / X[2], intrinsics, pixels[o], huber, J)
+            z = max(X[2], MIN_DEPTH)
+            _shared_jacobian(X[0] / z, X[1] / z, intrinsics, pixels[o], huber, J)
             c = 6 * cameras[o]
             for i in range(NUM_SHARED):
                 g[i] -= J[0, i] * r[0] + J[1, i] * r[1]

@@ -7,17 +7,19 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from laser_slam.backbones.classical.bundle import Bundle
+from laser_slam.backbones.classical.reconstruction_kernels import triangulate
 from laser_slam.backbones.classical.refinement import refine
 from laser_slam.backbones.classical.tracking import FrameTracks
 from laser_slam.backbones.classical.twoview import absolute_pose, choose_pair, relative_pose
 from laser_slam.sim3 import Array
 
 MIN_VIEWS = 3
-MIN_POINTS = 40  # fewer do not hold a camera
+MIN_POINTS = 40  # of a window; fewer say nothing
+MIN_SEEN = 20  # points in one frame; fewer do not hold its camera
+MIN_INLIERS = 30  # of the starting pair
 MIN_ANGLE = 0.004  # radians between the rays of a point
 PNP_ERROR_PX = 5.0  # at full width of 1280
 COARSE_ROUNDS = ((2.0, 6.0), (2.0, 3.0))  # Huber and limit, in pixels at full width of 1280
@@ -56,52 +58,18 @@ class Observations:
     ids: NDArray[np.int64]
 
 
-def collect(views: list[FrameTracks], min_views: int = MIN_VIEWS) -> Observations:
-    """Gather the tracks of some frames."""
+def collect(views: list[FrameTracks]) -> Observations:
+    """Gather the tracks that at least MIN_VIEWS of some frames see."""
     ids = np.concatenate([view.ids for view in views])
     cameras = np.repeat(np.arange(len(views)), [len(view.ids) for view in views])
     pixels = np.concatenate([view.pixels for view in views])
     order = np.lexsort((cameras, ids))
     ids, cameras, pixels = ids[order], cameras[order], pixels[order]
     unique, counts = np.unique(ids, return_counts=True)
-    keep = np.repeat(counts >= min_views, counts)
-    starts = np.concatenate([[0], np.cumsum(counts[counts >= min_views])]).astype(np.int64)
-    return Observations(cameras[keep], starts, pixels[keep], unique[counts >= min_views])
-
-
-@njit(cache=True, nogil=True)
-def triangulate(rotations, translations, has_pose, cameras, starts, pixels, intrinsics):  # type: ignore[no-untyped-def]  # noqa: PLR0913
-    """Return (P, 3) points nearest to their rays, and (P,) widest angle between two rays (0: none)."""
-    num = starts.shape[0] - 1
-    points, angles = np.zeros((num, 3)), np.zeros(num)
-    for point in range(num):
-        A, b = np.zeros((3, 3)), np.zeros(3)
-        first, views, cosine = np.zeros(3), 0, 1.0
-        for o in range(starts[point], starts[point + 1]):
-            c = cameras[o]
-            if not has_pose[c]:
-                continue
-            ray = np.array(
-                [
-                    (pixels[o, 0] - intrinsics[2]) / intrinsics[0],
-                    (pixels[o, 1] - intrinsics[3]) / intrinsics[1],
-                    1.0,
-                ]
-            )
-            ray = rotations[c].T @ (ray / np.sqrt((ray * ray).sum()))
-            centre = -(rotations[c].T @ translations[c])
-            across = np.eye(3) - np.outer(ray, ray)
-            A += across
-            b += across @ centre
-            if views == 0:
-                first = ray
-            cosine = min(cosine, (first * ray).sum())
-            views += 1
-        angle = np.arccos(max(-1.0, cosine))
-        if views >= 2 and angle > 1e-5:
-            points[point] = np.linalg.solve(A, b)
-            angles[point] = angle
-    return points, angles
+    enough = counts >= MIN_VIEWS
+    keep = np.repeat(enough, counts)
+    starts = np.concatenate([[0], np.cumsum(counts[enough])]).astype(np.int64)
+    return Observations(cameras[keep], starts, pixels[keep], unique[enough])
 
 
 class Solver:
@@ -119,7 +87,6 @@ class Solver:
         self.rotations = np.tile(np.eye(3), (num, 1, 1))
         self.translations = np.zeros((num, 3))
         self.has_pose = np.zeros(num, bool)
-        self.is_fixed = np.zeros(num, bool)
 
     def start_from_pair(self) -> bool:
         """Place two views by their essential matrix; False: no pair moves enough."""
@@ -127,7 +94,9 @@ class Solver:
         if pair is None:
             return False
         i, j = pair
-        R, t, _ = relative_pose(self._views[i], self._views[j], self._K, 2.0 * self._unit)
+        R, t, inliers = relative_pose(self._views[i], self._views[j], self._K, 2.0 * self._unit)
+        if inliers < MIN_INLIERS:
+            return False
         self.rotations[j], self.translations[j] = R, t
         self.has_pose[[i, j]] = True
         return True
@@ -142,15 +111,12 @@ class Solver:
 
     def grow(self) -> None:
         """Place the other views outwards from those that are placed."""
-        placed = np.flatnonzero(self.has_pose)
-        order = [*range(placed[0] + 1, len(self._views)), *range(placed[0] - 1, -1, -1)]
-        done = 0
-        for camera in order:
-            if self.has_pose[camera]:
-                continue
-            points, good = self._points()
-            self._place(camera, points, good)
-            done += 1
+        if not self.has_pose.any():
+            return
+        start, num = int(np.flatnonzero(self.has_pose)[0]), len(self._views)
+        order = [c for c in (*range(start, num), *range(start - 1, -1, -1)) if not self.has_pose[c]]
+        for done, camera in enumerate(order, start=1):
+            self._place(camera)
             if done in LOCAL_ADJUSTMENTS:
                 self.adjust(2.0 * self._unit, 8, 8.0)
 
@@ -166,21 +132,28 @@ class Solver:
         )
         return points, angles > MIN_ANGLE
 
-    def _place(self, camera: int, points: Array, good: NDArray[np.bool_]) -> None:
+    def _place(self, camera: int) -> None:
+        """Find the pose of one view from the points that the placed ones see."""
+        points, good = self._points()
         point_of = np.repeat(np.arange(len(points)), np.diff(self._all.starts))
         use = (self._all.cameras == camera) & good[point_of]
-        if use.sum() < MIN_POINTS // 2:
+        if use.sum() < MIN_SEEN:
             return
         R, t, inliers = absolute_pose(
             self._all.pixels[use], points[point_of[use]], self._K, PNP_ERROR_PX * self._unit
         )
-        if inliers >= MIN_POINTS // 2:
+        if inliers >= MIN_SEEN:
             self.rotations[camera], self.translations[camera] = R, t
             self.has_pose[camera] = True
 
     def bundle(self, max_error_px: float) -> tuple[Bundle, NDArray[np.int64]]:
-        """Triangulate everything and keep what fits; returns the bundle and its track numbers."""
+        """Triangulate everything and keep what fits; returns the bundle and its track numbers.
+
+        The first placed view is held, and so are those that have no pose.
+        """
         points, good = self._points()
+        is_fixed = ~self.has_pose
+        is_fixed[np.flatnonzero(self.has_pose)[:1]] = True
         bundle = Bundle(
             self.rotations,
             self.translations,
@@ -188,7 +161,7 @@ class Solver:
             self._all.cameras,
             self._all.starts,
             self._all.pixels,
-            self.is_fixed | ~self.has_pose,
+            is_fixed,
             self._flat,
         )
         keep = bundle.residuals() < max_error_px * self._unit
@@ -201,16 +174,8 @@ class Solver:
         if self.has_pose.sum() < 2:
             return
         bundle, _ = self.bundle(max_error_px)
-        if len(bundle.points) < MIN_POINTS // 2:
-            return
-        self._anchor(bundle)
-        bundle.adjust(huber_px, iterations)
-
-    def _anchor(self, bundle: Bundle) -> None:
-        """Hold the first placed view when nothing else does."""
-        if not self.is_fixed.any():
-            bundle.is_fixed = bundle.is_fixed.copy()
-            bundle.is_fixed[np.flatnonzero(self.has_pose)[0]] = True
+        if len(bundle.points) >= MIN_SEEN:
+            bundle.adjust(huber_px, iterations)
 
     def finish(self, refine_radius: int = 0) -> Reconstruction | None:
         """Adjust in rounds, each with less tolerance; measure the tracks again in between.
@@ -225,16 +190,29 @@ class Solver:
         if self.has_pose.sum() < MIN_VIEWS:
             return None
         bundle, ids = self.bundle(8.0)
-        self._anchor(bundle)
         ids = self._settle(bundle, ids, COARSE_ROUNDS)
         if refine_radius:
             greys = [view.grey.astype(np.float32) for view in self._views]
             blurred = np.stack([cv2.GaussianBlur(grey, (0, 0), BLUR_PX) for grey in greys])
             ids = ids[bundle.select(refine(bundle, blurred, refine_radius), MIN_VIEWS)]
             ids = self._settle(bundle, ids, FINE_ROUNDS)
-        if len(bundle.points) < MIN_POINTS:
+        ids = self._drop_loose_views(bundle, ids)
+        is_finite = np.isfinite(self.translations).all() and np.isfinite(bundle.points).all()
+        if len(bundle.points) < MIN_POINTS or not is_finite:
             return None
         return Reconstruction(self.rotations, self.translations, self.has_pose, bundle, ids)
+
+    def _drop_loose_views(self, bundle: Bundle, ids: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Take the pose from views that kept too few points to hold them."""
+        while True:
+            seen = np.bincount(bundle.cameras, minlength=len(self._views))
+            is_loose = self.has_pose & (seen < MIN_SEEN)
+            if not is_loose.any():
+                return ids
+            self.has_pose = self.has_pose & ~is_loose
+            bundle.is_fixed = ~self.has_pose
+            bundle.is_fixed[np.flatnonzero(self.has_pose)[:1]] = True
+            ids = ids[bundle.select(~is_loose[bundle.cameras], MIN_VIEWS)]
 
     def mean_squared_error(self, bundle: Bundle, limit_px: float) -> float:
         """Return the mean over all observations, errors capped and lost ones at the limit."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import poselib
@@ -14,6 +15,7 @@ from laser_slam.sim3 import Array, orthonormal
 GAPS = (2, 3, 4, 6, 8, 12)  # frames between the two views of a starting pair
 ENOUGH_PARALLAX_PX = 12.0
 ENOUGH_MATCHES = 200
+MIN_PARALLAX_PX = 2.0  # at full width of 1280; less is the noise of the tracks
 MIN_MATCHES = 30
 
 
@@ -73,6 +75,7 @@ def fit_rotation(source: Array, target: Array, iterations: int = 6) -> Array:
 
 def choose_pair(views: list[FrameTracks], intrinsics: Array) -> tuple[int, int] | None:
     """Choose the two views to start from: much parallax and many matches; None: nothing moves."""
+    least = MIN_PARALLAX_PX * views[0].grey.shape[1] / 1280
     starts = sorted({0, len(views) // 3, len(views) // 2})
     pairs = [(s, s + gap) for s in starts for gap in GAPS if s + gap < len(views)]
     best, best_score = None, 0.0
@@ -80,25 +83,28 @@ def choose_pair(views: list[FrameTracks], intrinsics: Array) -> tuple[int, int] 
         motion = measure_motion(views[i], views[j], intrinsics)
         share = min(motion.num_matches, ENOUGH_MATCHES) / ENOUGH_MATCHES
         score = min(motion.parallax_px, ENOUGH_PARALLAX_PX) * np.sqrt(share)
-        if motion.num_matches >= MIN_MATCHES and score > best_score:
+        if motion.parallax_px >= least and score > best_score:
             best, best_score = (i, j), score
     return best
 
 
 def camera_dict(intrinsics: Array) -> dict[str, object]:
-    """Describe a pinhole camera as poselib wants it; its pixel centres are at +0.5."""
+    """Describe a pinhole camera as poselib wants it.
+
+    It applies the parameters as they are, so pixel centres stay where ours are: at integers. Width
+    and height must be there, and nothing reads them.
+    """
     params = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
-    width, height = 2 * intrinsics[0, 2], 2 * intrinsics[1, 2]
-    return {"model": "PINHOLE", "width": int(width), "height": int(height), "params": params}
+    return {"model": "PINHOLE", "width": 0, "height": 0, "params": params}
 
 
 def relative_pose(
     first: FrameTracks, second: FrameTracks, intrinsics: Array, max_error_px: float
-) -> tuple[Array, Array, float]:
+) -> tuple[Array, Array, int]:
     """Estimate second_from_first by RANSAC on the essential matrix.
 
     Returns:
-        (3, 3) rotation, (3,) unit translation, share of inliers.
+        (3, 3) rotation, (3,) unit translation, number of inliers (0: no pose).
     """
     a, b, _ = match(first, second)
     camera = camera_dict(intrinsics)
@@ -106,7 +112,7 @@ def relative_pose(
     pose, info = poselib.estimate_relative_pose(a, b, camera, camera, options, {})
     translation = np.asarray(pose.t, dtype=np.float64)
     length = max(float(np.linalg.norm(translation)), 1e-12)
-    return np.asarray(pose.R), translation / length, float(info["num_inliers"]) / len(a)
+    return np.asarray(pose.R), translation / length, _num_inliers(pose, info)
 
 
 def absolute_pose(
@@ -121,4 +127,10 @@ def absolute_pose(
     pose, info = poselib.estimate_absolute_pose(
         pixels, points, camera_dict(intrinsics), options, {}
     )
-    return np.asarray(pose.R), np.asarray(pose.t), int(info["num_inliers"])
+    return np.asarray(pose.R), np.asarray(pose.t), _num_inliers(pose, info)
+
+
+def _num_inliers(pose: poselib.CameraPose, info: dict[str, Any]) -> int:
+    """Return how many measurements agree with a pose; where all fail, poselib's pose is NaN."""
+    is_pose = np.isfinite(pose.R).all() and np.isfinite(pose.t).all()
+    return int(info["num_inliers"]) if is_pose else 0
