@@ -10,7 +10,7 @@ import yaml
 from numpy.typing import NDArray
 
 from laser_slam.camera import distort, resize_intrinsics
-from laser_slam.errors import RunFolderError
+from laser_slam.errors import DegenerateGeometryError, RunFolderError
 from laser_slam.store import write_text
 from laser_slam.types import Calibration, Image
 
@@ -34,6 +34,9 @@ class Rectifier:
         Args:
             calibration: of the camera, at any size.
             size: (height, width) of the images that come out.
+
+        Raises:
+            DegenerateGeometryError: the distortion is stronger than a lens can have.
         """
         self._size = size
         self._map: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
@@ -62,7 +65,8 @@ class Rectifier:
 
     def depth(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """Rectify an (H, W) depth map by its nearest pixels; NaN stays NaN."""
-        small = cv2.resize(depth, self._size[::-1], interpolation=cv2.INTER_NEAREST)
+        # INTER_NEAREST would take each block's corner, half a block off
+        small = cv2.resize(depth, self._size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
         if self._map is None:
             return np.asarray(small)
         options = (cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, np.nan)
@@ -94,14 +98,26 @@ def load_calibration(path: Path) -> Calibration:
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
         K = content["intrinsics"]
-        return Calibration(
+        height, width = content["size"]
+        calibration = Calibration(
             None if K is None else np.array(K, np.float64).reshape(3, 3),
             np.array(content["distortion"], np.float64).reshape(2),
-            (int(content["size"][0]), int(content["size"][1])),
+            (int(height), int(width)),
             str(content["source"]),
         )
+        _check(calibration)
     except (OSError, yaml.YAMLError, TypeError, KeyError, ValueError) as error:
         raise RunFolderError(f"{path} is no calibration: remove it to calibrate again") from error
+    return calibration
+
+
+def _check(calibration: Calibration) -> None:
+    """Refuse numbers that no camera has."""
+    K = calibration.intrinsics
+    if min(calibration.size) < 1 or not np.isfinite(calibration.distortion).all():
+        raise ValueError("size and distortion")
+    if K is not None and not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        raise ValueError("intrinsics")
 
 
 def _grid(size: tuple[int, int]) -> Array:
@@ -140,6 +156,11 @@ def _zoom(lens: Array, distortion: Array, size: tuple[int, int]) -> float:
     low, high = 1.0, MAX_ZOOM
     if fits(low):
         return low
+    if not fits(high):
+        k1, k2 = distortion
+        raise DegenerateGeometryError(
+            f"no lens has the distortion k1 = {k1:.3g}, k2 = {k2:.3g}: correct the calibration"
+        )
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         low, high = (low, middle) if fits(middle) else (middle, high)

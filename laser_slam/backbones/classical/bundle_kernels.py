@@ -62,12 +62,16 @@ def _cost(rotations, translations, points, cameras, starts, pixels, intrinsics, 
 def linearise(R, t, point, pixel, intrinsics, huber, J_cam, J_point, residual):
     """Fill the weighted Jacobians and residual of one observation.
 
-    The pose moves as ``exp(w) R x + t + d``: derivatives by w (3), then d (3).
+    The pose moves as ``exp(w) R x + t + d``: derivatives by w (3), then d (3). Behind the camera
+    all are zero.
     """
     rx = R[0, 0] * point[0] + R[0, 1] * point[1] + R[0, 2] * point[2]
     ry = R[1, 0] * point[0] + R[1, 1] * point[1] + R[1, 2] * point[2]
     rz = R[2, 0] * point[0] + R[2, 1] * point[1] + R[2, 2] * point[2]
-    x, y, z = rx + t[0], ry + t[1], max(rz + t[2], MIN_DEPTH)
+    x, y, z = rx + t[0], ry + t[1], rz + t[2]
+    if z <= MIN_DEPTH:
+        J_cam[:], J_point[:], residual[:] = 0.0, 0.0, 0.0
+        return
     xn, yn = x / z, y / z
     u, v = distorted(xn, yn, intrinsics)
     du, dv = u - pixel[0], v - pixel[1]

@@ -29,6 +29,7 @@ from laser_slam.types import Calibration, Window
 
 ROUNDS = 8
 SETTLED = 2e-4  # step of relative focal length, k1 and k2 at which it stops
+SLACK = 1e-3  # by which the cost may seem to rise, for no bundle is adjusted to the end
 HUBER_PX = 0.5  # at full width of 1280, as all pixels here
 NOISE_PX = 1.5  # of a track, as if tracks were independent: five times what one measures
 # Standard deviations of what is assumed before: relative focal length, k1, k2.
@@ -45,8 +46,13 @@ MAX_STATE = 0.5  # of relative focal length, k1, k2; beyond it, the equations ha
 
 
 @dataclass(frozen=True)
-class _Clip:
-    """A window's tracks, and how far the camera turned."""
+class Clip:
+    """A window's tracks.
+
+    Attributes:
+        views: what was seen in each of its frames.
+        turn_deg: how far the camera turned from the first to the last.
+    """
 
     views: list[FrameTracks]
     turn_deg: float
@@ -88,17 +94,27 @@ def calibrate(
     Raises:
         DegenerateGeometryError: there is no window.
     """
-    clips = _track(windows, intrinsics, config)
+    clips = follow(windows, intrinsics, config)
     if not clips:
         raise DegenerateGeometryError("no window to calibrate the camera by")
+    return calibrate_clips(clips, intrinsics, config, workers)
+
+
+def calibrate_clips(
+    clips: list[Clip],
+    intrinsics: Array | None,
+    config: ClassicalConfig,
+    workers: ThreadPoolExecutor,
+) -> Calibration:
+    """Measure how the camera projects from one or more windows' tracks; see `calibrate`."""
     known = None if intrinsics is None else _Start(intrinsics, KNOWN_PRIOR, "given")
     return _refine(clips, known or _guess(clips, workers), config, workers)
 
 
-def _track(
+def follow(
     windows: Iterable[Window], intrinsics: Array | None, config: ClassicalConfig
-) -> list[_Clip]:
-    """Follow corners through all windows; a frame that windows share is tracked once."""
+) -> list[Clip]:
+    """Follow corners through all windows; a frame that neighbours share is tracked once."""
     tracker, clips = Tracker(config, memory=1), []
     seen: dict[int, FrameTracks] = {}
     for window in windows:
@@ -109,18 +125,19 @@ def _track(
             seen[frame] = before[frame] if frame in before else tracker.history[-1]
         views = list(seen.values())
         K = guess_intrinsics(*views[0].grey.shape) if intrinsics is None else intrinsics
-        clips.append(_Clip(views, _turn_deg(views, K)))
+        clips.append(make_clip(views, K))
     return clips
 
 
-def _turn_deg(views: list[FrameTracks], K: Array) -> float:
+def make_clip(views: list[FrameTracks], intrinsics: Array) -> Clip:
+    """Measure how far the camera turned in a window; rough intrinsics will do."""
     rotation = np.eye(3)
     for first, second in pairwise(views):
-        rotation = measure_motion(first, second, K).second_from_first @ rotation
-    return float(np.degrees(np.linalg.norm(rotation_log(rotation))))
+        rotation = measure_motion(first, second, intrinsics).second_from_first @ rotation
+    return Clip(views, float(np.degrees(np.linalg.norm(rotation_log(rotation)))))
 
 
-def _solve(clip: _Clip, K: Array, refine_radius: int) -> tuple[Solver, Reconstruction | None]:
+def _solve(clip: Clip, K: Array, refine_radius: int) -> tuple[Solver, Reconstruction | None]:
     solver = Solver(clip.views, K)
     if not solver.start_from_pair():
         return solver, None
@@ -128,7 +145,7 @@ def _solve(clip: _Clip, K: Array, refine_radius: int) -> tuple[Solver, Reconstru
     return solver, solver.finish(refine_radius)
 
 
-def _guess(clips: list[_Clip], workers: ThreadPoolExecutor) -> _Start:
+def _guess(clips: list[Clip], workers: ThreadPoolExecutor) -> _Start:
     """Find the focal length at which the windows that turn most fit best."""
     height, width = clips[0].views[0].grey.shape
     turning = sorted(clips, key=lambda clip: (-clip.turn_deg, clip.views[0].frame))[:NUM_SCANNED]
@@ -146,7 +163,7 @@ def _guess(clips: list[_Clip], workers: ThreadPoolExecutor) -> _Start:
     return _Start(guess_intrinsics(height, width, focal), SCANNED_PRIOR, source)
 
 
-def _scan_focal(clips: list[_Clip], workers: ThreadPoolExecutor) -> tuple[float, float]:
+def _scan_focal(clips: list[Clip], workers: ThreadPoolExecutor) -> tuple[float, float]:
     """Try focal lengths; return the best, in image widths, and its contrast to the others."""
     cost = partial(_cost, clips)
     tried = dict(zip(FOCALS, workers.map(cost, FOCALS), strict=True))
@@ -158,7 +175,7 @@ def _scan_focal(clips: list[_Clip], workers: ThreadPoolExecutor) -> tuple[float,
     return best, 1.0 - tried[best] / float(np.median(list(tried.values())))
 
 
-def _cost(clips: list[_Clip], focal: float) -> float:
+def _cost(clips: list[Clip], focal: float) -> float:
     """Return the mean squared error of all observations, those that were lost at LOST_PX."""
     height, width = clips[0].views[0].grey.shape
     lost = (LOST_PX * width / 1280) ** 2
@@ -170,7 +187,7 @@ def _cost(clips: list[_Clip], focal: float) -> float:
 
 
 def _refine(
-    clips: list[_Clip], start: _Start, config: ClassicalConfig, workers: ThreadPoolExecutor
+    clips: list[Clip], start: _Start, config: ClassicalConfig, workers: ThreadPoolExecutor
 ) -> Calibration:
     """Adjust all windows and the calibration together."""
     height, width = clips[0].views[0].grey.shape
@@ -237,7 +254,7 @@ def _optimise(
         if np.abs(state).max() > MAX_STATE:
             return None
         if np.abs(step).max() < SETTLED:
-            return state if costs[-1] <= costs[0] else None
+            return state if costs[-1] <= costs[0] * (1 + SLACK) else None
     return None
 
 

@@ -17,7 +17,7 @@ NUM_SHARED = 3  # relative focal length, k1, k2
 
 
 @njit(cache=True, nogil=True)
-def _shared_jacobian(x, y, intrinsics, pixel, huber, out):
+def shared_jacobian(x, y, intrinsics, pixel, huber, out):
     """Fill (2, 3): weighted derivatives of the pixel of ray (x, y, 1) by focal length, k1, k2."""
     r2 = x * x + y * y
     radial = 1 + r2 * (intrinsics[4] + r2 * intrinsics[5])
@@ -53,9 +53,10 @@ def shared_equations(rotations, translations, points, cameras, starts, pixels, i
         for o in range(starts[point], starts[point + 1]):
             R, t = rotations[cameras[o]], translations[cameras[o]]
             X = R @ points[point] + t
+            if X[2] <= MIN_DEPTH:
+                continue
             linearise(R, t, points[point], pixels[o], intrinsics, huber, J_cam, J_point, r)
-            z = max(X[2], MIN_DEPTH)
-            _shared_jacobian(X[0] / z, X[1] / z, intrinsics, pixels[o], huber, J)
+            shared_jacobian(X[0] / X[2], X[1] / X[2], intrinsics, pixels[o], huber, J)
             c = 6 * cameras[o]
             for i in range(NUM_SHARED):
                 g[i] -= J[0, i] * r[0] + J[1, i] * r[1]
