@@ -61,8 +61,8 @@ class ClassicalConfig(_Section):
 
     max_width: int = Field(1280, ge=160, description="images wider than this are reduced, px")
     track_width: int = Field(640, ge=160, description="width at which corners are tracked, px")
-    track_patch: int = Field(7, ge=5, le=31, description="side of the tracked patch, px")
-    num_features: int = Field(600, ge=100, description="corners per frame")
+    track_patch: int = Field(15, ge=5, le=31, description="side of the tracked patch, px")
+    num_features: int = Field(1000, ge=100, description="corners per frame")
     max_backward_px: float = Field(0.7, gt=0, description="forward-backward gap of a good track")
     refine_radius: int = Field(
         5, ge=0, le=10, description="half side of the patches that are aligned, px; 0: none are"

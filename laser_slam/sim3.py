@@ -11,6 +11,8 @@ from laser_slam.errors import DegenerateGeometryError
 
 Array = NDArray[np.float64]
 
+STEPS_OF_VELOCITY = 5  # the last steps are the least certain: average a few
+
 
 def _identity_rotation() -> Array:
     return np.eye(3)
@@ -187,3 +189,51 @@ def interpolate_poses(times_s: Array, key_times_s: Array, world_from_key: Array)
     for axis in range(3):
         out[:, axis, 3] = np.interp(clipped, key_times_s, world_from_key[:, axis, 3])
     return out
+
+
+def complete_poses(frames: NDArray[np.int64], known: NDArray[np.int64], poses: Array) -> Array:
+    """Give every frame a pose: interpolated between known ones, beyond them at their last speed.
+
+    Args:
+        frames: (M,) rising indices.
+        known: (N,) rising indices of the frames whose pose is known, N >= 1.
+        poses: (N, 4, 4) rigid world_from_cam.
+
+    Returns:
+        (M, 4, 4) rigid world_from_cam; a known pose comes back unchanged.
+    """
+    out = interpolate_poses(frames.astype(np.float64), known.astype(np.float64), poses)
+    after, before = np.flatnonzero(frames > known[-1]), np.flatnonzero(frames < known[0])[::-1]
+    _continue(out, after, frames, known[::-1], poses[::-1])
+    _continue(out, before, frames, known, poses)
+    return out
+
+
+def _continue(
+    out: Array,
+    beyond: NDArray[np.int64],
+    frames: NDArray[np.int64],
+    known: NDArray[np.int64],
+    poses: Array,
+) -> None:
+    """Fill the poses ``beyond`` an end, outwards; ``known`` and ``poses`` start at that end."""
+    frame, pose = int(known[0]), poses[0]
+    turn, move = _velocity(known[: STEPS_OF_VELOCITY + 1], poses[: STEPS_OF_VELOCITY + 1])
+    for i in beyond:
+        gap = int(frames[i]) - frame
+        step = np.eye(4)
+        step[:3, :3] = rotation_exp(gap * turn)
+        step[:3, 3] = gap * move
+        frame, pose = int(frames[i]), pose @ step
+        out[i] = pose
+
+
+def _velocity(frames: NDArray[np.int64], poses: Array) -> tuple[Array, Array]:
+    """Return the mean rotation vector and translation per frame, in camera axes."""
+    gaps = np.diff(frames)[:, None]
+    if not len(gaps):
+        return np.zeros(3), np.zeros(3)
+    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
+    return (rotation_log(steps[:, :3, :3]) / gaps).mean(axis=0), (steps[:, :3, 3] / gaps).mean(
+        axis=0
+    )

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from laser_slam.config import Config
 from laser_slam.errors import DegenerateGeometryError
 from laser_slam.registration import bridge, register
-from laser_slam.sim3 import Sim3, rotation_exp, rotation_log
+from laser_slam.sim3 import Sim3, complete_poses
 from laser_slam.types import Image, Prediction, Registration, Submap, Trajectory, WindowStatus
 
 Array = NDArray[np.float64]
 
-STEPS_OF_VELOCITY = 5  # a window's last steps are its least certain: average a few
 logger = logging.getLogger(__name__)
 
 
@@ -186,41 +185,7 @@ def _without_failure(prediction: Prediction, last: Prediction | None) -> Predict
     if last is None:
         standing = np.tile(np.eye(4), (len(prediction.frames), 1, 1))
         return replace(prediction, window_from_cam=standing)
-    return replace(prediction, window_from_cam=_continue_motion(last, prediction.frames))
-
-
-def _continue_motion(last: Prediction, frames: NDArray[np.int64]) -> Array:
-    """Extend the last window's poses at constant velocity, in its frame and unit.
-
-    Args:
-        last: the window whose motion goes on.
-        frames: (N,) rising indices; those that ``last`` has keep their pose.
-
-    Returns:
-        (N, 4, 4) rigid ``last_window_from_cam``.
-    """
-    turn, move = _velocity(last)
-    known = dict(zip(last.frames.tolist(), last.window_from_cam, strict=True))
-    frame, pose = max(known.items())
-    poses = []
-    for wanted in frames.tolist():
-        if wanted in known:
-            poses.append(known[wanted])
-            continue
-        step = np.eye(4)
-        step[:3, :3] = rotation_exp((wanted - frame) * turn)
-        step[:3, 3] = (wanted - frame) * move
-        frame, pose = wanted, pose @ step
-        poses.append(pose)
-    return np.stack(poses)
-
-
-def _velocity(last: Prediction) -> tuple[Array, Array]:
-    """Return rotation vector and translation per frame, in camera axes, at a window's end."""
-    poses = last.window_from_cam[-STEPS_OF_VELOCITY - 1 :]
-    gaps = np.diff(last.frames[-STEPS_OF_VELOCITY - 1 :])[:, None]
-    if not len(gaps):
-        return np.zeros(3), np.zeros(3)
-    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
-    turn = rotation_log(steps[:, :3, :3]) / gaps
-    return turn.mean(axis=0), (steps[:, :3, 3] / gaps).mean(axis=0)
+    return replace(
+        prediction,
+        window_from_cam=complete_poses(prediction.frames, last.frames, last.window_from_cam),
+    )

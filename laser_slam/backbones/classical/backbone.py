@@ -5,24 +5,24 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.backbones.classical.calibration import calibrate
-from laser_slam.backbones.classical.dense import PosedFrames, dense_depth, depth_size
+from laser_slam.backbones.classical.dense import depth_size
+from laser_slam.backbones.classical.prediction import with_depth, without_depth
 from laser_slam.backbones.classical.reconstruction import Reconstruction, Solver
 from laser_slam.backbones.classical.tracking import FrameTracks, Tracker
-from laser_slam.backbones.classical.twoview import measure_motion
-from laser_slam.camera import guess_intrinsics, resize_intrinsics
+from laser_slam.camera import guess_intrinsics
 from laser_slam.config import BackboneConfig
-from laser_slam.sim3 import Array, interpolate_poses
-from laser_slam.types import Calibration, Image, Prediction, Window, WindowStatus
+from laser_slam.sim3 import Array
+from laser_slam.types import Calibration, Image, Prediction, Window
 
-STILL_PX, MOVED_PX = 1.0, 1.5  # parallax and flow at 640 wide
-MAX_WINDOW = 128
+MAX_WINDOW = 128  # keyframes
+MIN_KNOWN = 3  # frames with poses that a window can go on from
+MIN_PLACED = 0.25  # share of a window's frames that make it worth its depth
 
 
 class ClassicalBackbone:
@@ -57,13 +57,17 @@ class ClassicalBackbone:
         intrinsics: NDArray[np.float64] | None,
     ) -> Prediction:
         """Predict one window; see `laser_slam.backbones.base.Backbone`."""
-        height, width = images[0].shape[:2]
-        K = guess_intrinsics(height, width) if intrinsics is None else intrinsics
+        K = guess_intrinsics(*images[0].shape[:2]) if intrinsics is None else intrinsics
         views = self._track(images, frames)
-        solution, warnings = self._solve(views, frames, K)
-        if solution is None:
-            return self._without_depth(views, frames, K)
-        return self._dense(views, frames, K, solution, warnings)
+        window = views[-len(frames) :]
+        for used in (views, window):  # where the context does not carry on, without it
+            solution = self._reconstruct(used, K)
+            if solution is None or solution.has_pose[-len(frames) :].mean() < MIN_PLACED:
+                continue
+            self._poses = solution.poses_of([view.frame for view in used])
+            return with_depth(used, solution, frames, K, self._config, self._workers)
+        self._poses = {}
+        return without_depth(window, frames, K, self._config)
 
     def _new_tracker(self) -> Tracker:
         return Tracker(self._config, self._config.context + MAX_WINDOW)
@@ -80,115 +84,12 @@ class ClassicalBackbone:
         first = next(i for i, view in enumerate(history) if view.frame == frames[0])
         return history[max(0, first - self._config.context) :]
 
-    def _solve(
-        self, views: list[FrameTracks], frames: NDArray[np.int64], K: Array
-    ) -> tuple[Reconstruction | None, tuple[str, ...]]:
-        """Reconstruct context and window; without the context where that fails."""
-        is_window = np.array([view.frame >= frames[0] for view in views])
-        for is_used in (np.ones(len(views), bool), is_window):
-            used = [view for view, keep in zip(views, is_used, strict=True) if keep]
-            solver = Solver(used, K)
-            if not self._start(solver, used):
-                continue
-            solver.grow()
-            solution = solver.finish(self._config.refine_radius)
-            if solution is not None and solution.has_pose[-len(frames) :].mean() > 0.5:
-                self._remember(used, solution)
-                return solution, ()
-        self._poses = {}
-        return None, ()
-
-    def _start(self, solver: Solver, views: list[FrameTracks]) -> bool:
-        known = [view.frame in self._poses for view in views]
-        if sum(known) < 3:
-            return solver.start_from_pair()
-        R = np.stack(
-            [self._poses[v.frame][0] if v.frame in self._poses else np.eye(3) for v in views]
-        )
-        t = np.stack(
-            [self._poses[v.frame][1] if v.frame in self._poses else np.zeros(3) for v in views]
-        )
-        solver.start_from_known(R, t, np.array(known))
-        return True
-
-    def _remember(self, views: list[FrameTracks], solution: Reconstruction) -> None:
-        self._poses = {
-            view.frame: (solution.rotations[i], solution.translations[i])
-            for i, view in enumerate(views)
-            if solution.has_pose[i]
-        }
-
-    def _dense(self, views, frames, K, solution, warnings) -> Prediction:  # type: ignore[no-untyped-def]
-        """Sweep the window's frames and express everything in units of the median depth."""
-        num = len(solution.rotations)
-        used = views[-num:]
-        bundle = solution.bundle
-        points = bundle.points[bundle.point_of]
-        z = np.einsum("mj,mj->m", bundle.rotations[bundle.cameras][:, 2], points)
-        z += bundle.translations[bundle.cameras][:, 2]
-        posed = np.flatnonzero(solution.has_pose)
-        sparse = [z[(bundle.cameras == c) & (z > 0)] for c in posed]
-        scene = PosedFrames(
-            [used[c].grey for c in posed],
-            solution.rotations[posed],
-            solution.translations[posed],
-            sparse,
-            K,
-        )
-        window = [i for i, c in enumerate(posed) if used[c].frame >= frames[0]]
-        depth, confidence, depth_K = dense_depth(scene, window, self._config, self._workers)
-        unit = float(np.median(np.concatenate([sparse[i] for i in window])))
-        slots = np.searchsorted(frames, [used[posed[i]].frame for i in window])
-        all_depth = np.full((len(frames), *depth.shape[1:]), np.nan, np.float32)
-        all_confidence = np.zeros(all_depth.shape, np.float32)
-        all_depth[slots], all_confidence[slots] = depth / unit, confidence
-        window_from_cam = np.tile(np.eye(4), (len(window), 1, 1))
-        R = solution.rotations[posed[window]]
-        window_from_cam[:, :3, :3] = R.transpose(0, 2, 1)
-        window_from_cam[:, :3, 3] = (
-            -np.einsum("cij,ci->cj", R, solution.translations[posed[window]]) / unit
-        )
-        first_from_window = np.linalg.inv(window_from_cam[0])
-        poses = interpolate_poses(
-            frames.astype(np.float64),
-            frames[slots].astype(np.float64),
-            first_from_window @ window_from_cam,
-        )
-        if len(slots) < len(frames):
-            warnings = (*warnings, f"{len(frames) - len(slots)} frames could not be placed")
-        return Prediction(
-            frames,
-            all_depth,
-            all_confidence,
-            poses,
-            np.tile(depth_K, (len(frames), 1, 1)),
-            WindowStatus.OK,
-            tuple(warnings),
-        )
-
-    def _without_depth(
-        self, views: list[FrameTracks], frames: NDArray[np.int64], K: Array
-    ) -> Prediction:
-        """Say what can be said of a window without a solution: rotations, if they explain it."""
-        window = views[-len(frames) :]
-        height, width = window[0].grey.shape
-        pixel = width / 640
-        motions = [measure_motion(a, b, K) for a, b in pairwise(window)]
-        poses = np.tile(np.eye(4), (len(frames), 1, 1))
-        status = WindowStatus.FAILED
-        if all(motion.num_matches >= 30 for motion in motions):
-            is_still = max(motion.flow_px for motion in motions) < MOVED_PX * pixel
-            status = WindowStatus.STATIC if is_still else WindowStatus.ROTATION
-            for i, motion in enumerate(motions):
-                poses[i + 1, :3, :3] = poses[i, :3, :3] @ motion.second_from_first.T
-        size = depth_size((height, width), self._config.depth_width)
-        depth = np.full((len(frames), *size), np.nan, np.float32)
-        depth_K = resize_intrinsics(K, (height, width), size)
-        return Prediction(
-            frames,
-            depth,
-            np.zeros_like(depth),
-            poses,
-            np.tile(depth_K, (len(frames), 1, 1)),
-            status,
-        )
+    def _reconstruct(self, views: list[FrameTracks], K: Array) -> Reconstruction | None:
+        solver = Solver(views, K)
+        known = {i: self._poses[v.frame] for i, v in enumerate(views) if v.frame in self._poses}
+        if len(known) >= MIN_KNOWN:
+            solver.start_from_known(known)
+        elif not solver.start_from_pair():
+            return None
+        solver.grow()
+        return solver.finish(self._config.refine_radius)

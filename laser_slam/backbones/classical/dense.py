@@ -103,7 +103,7 @@ def dense_depth(
 
 
 def plane_range(depths: Array, num: int) -> Float:
-    """Return (num,) inverse depths in equal steps from before the nearest to beyond the farthest."""
+    """Return (num,) inverse depths in equal steps, the sparse depths well inside."""
     near = NEAR * float(np.percentile(depths, 1))
     far = min(FAR * float(np.percentile(depths, 99)), FAR_MEDIANS * float(np.median(depths)))
     return np.linspace(1.0 / near, 1.0 / max(far, 2 * near), num, dtype=np.float32)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -46,6 +46,17 @@ class Reconstruction:
     has_pose: NDArray[np.bool_]
     bundle: Bundle
     ids: NDArray[np.int64]
+
+    def depths_of(self, camera: int) -> Array:
+        """Return the depths of the points that a camera sees, in front of it."""
+        points = self.bundle.points[self.bundle.point_of[self.bundle.cameras == camera]]
+        depths = points @ self.rotations[camera, 2] + self.translations[camera, 2]
+        return np.asarray(depths[depths > 0])
+
+    def poses_of(self, frames: list[int]) -> dict[int, tuple[Array, Array]]:
+        """Return the cam_from_window rotations and translations of the frames that have one."""
+        placed = np.flatnonzero(self.has_pose)
+        return {frames[c]: (self.rotations[c], self.translations[c]) for c in placed}
 
 
 @dataclass(frozen=True)
@@ -101,13 +112,11 @@ class Solver:
         self.has_pose[[i, j]] = True
         return True
 
-    def start_from_known(
-        self, rotations: Array, translations: Array, is_known: NDArray[np.bool_]
-    ) -> None:
-        """Take the known cam_from_window poses of earlier frames."""
-        self.rotations[is_known] = rotations[is_known]
-        self.translations[is_known] = translations[is_known]
-        self.has_pose |= is_known
+    def start_from_known(self, known: Mapping[int, tuple[Array, Array]]) -> None:
+        """Take the known cam_from_window rotations and translations of some of the views."""
+        for view, (rotation, translation) in known.items():
+            self.rotations[view], self.translations[view] = rotation, translation
+            self.has_pose[view] = True
 
     def grow(self) -> None:
         """Place the other views outwards from those that are placed."""
