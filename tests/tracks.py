@@ -38,7 +38,7 @@ class Drive:
     def rotations(self) -> Array:
         """cam_from_world."""
         yaw = np.radians(self.turn_deg) * np.linspace(0, 1, self.num_frames)
-        return rotation_exp(np.stack([0 * yaw, -yaw, 0 * yaw], axis=1))
+        return np.asarray(rotation_exp(np.stack([0 * yaw, -yaw, 0 * yaw], axis=1)))
 
     @cached_property
     def centres(self) -> Array:
@@ -57,7 +57,7 @@ class Drive:
         points = np.stack([x, rng.uniform(-6, 1.7, self.num_points), z], axis=1)
         around = self.rotations[-1].T @ points[: self.num_points // 2].T
         points[: self.num_points // 2] = around.T + self.centres[-1]
-        return points
+        return np.asarray(points)
 
     def true_pixels(self, frame: int) -> tuple[Array, Array]:
         """Return (P, 2) pixels and (P,) depths of all points."""
