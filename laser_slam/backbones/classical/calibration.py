@@ -28,6 +28,7 @@ from laser_slam.sim3 import Array, rotation_log
 from laser_slam.types import Calibration, Window
 
 ROUNDS = 8
+SIGNIFICANT = 60.0  # chi-squared of 3 numbers, lenient: the windows are few and overlap
 SETTLED = 2e-4  # step of relative focal length, k1 and k2 at which it stops
 SLACK = 1e-3  # by which the cost may seem to rise, for no bundle is adjusted to the end
 HUBER_PX = 0.5  # at full width of 1280, as all pixels here
@@ -66,11 +67,13 @@ class _Start:
         intrinsics: (3, 3) in pixels.
         sigmas: of its relative focal length, and of k1 and k2 around zero.
         source: where it comes from, in words.
+        is_given: it stays as it is unless the windows clearly agree on another.
     """
 
     intrinsics: Array
     sigmas: tuple[float, float, float]
     source: str
+    is_given: bool = False
 
 
 def calibrate(
@@ -107,7 +110,7 @@ def calibrate_clips(
     workers: ThreadPoolExecutor,
 ) -> Calibration:
     """Measure how the camera projects from one or more windows' tracks; see `calibrate`."""
-    known = None if intrinsics is None else _Start(intrinsics, KNOWN_PRIOR, "given")
+    known = None if intrinsics is None else _Start(intrinsics, KNOWN_PRIOR, "given", is_given=True)
     return _refine(clips, known or _guess(clips, workers), config, workers)
 
 
@@ -199,13 +202,18 @@ def _refine(
         return Calibration(K, np.zeros(2), size, source)
     found = _optimise(bundles, np.array(start.sigmas), width / 1280, workers)
     corner = np.abs([[0, 0], [width - 1, height - 1]] - K[:2, 2]).max(axis=0)
-    if found is None or _folds(found[1:], corner / K[[0, 1], [0, 1]]):
+    if found is None or _folds(found[0][1:], corner / K[[0, 1], [0, 1]]):
         source = f"{start.source}, unrefined: the clip does not tell"
         return Calibration(K, np.zeros(2), size, source)
+    state, covariance = found
+    significance = float(state @ np.linalg.pinv(covariance) @ state)
+    if start.is_given and significance < SIGNIFICANT:
+        source = f"{start.source}, confirmed on {len(bundles)} windows"
+        return Calibration(K, np.zeros(2), size, source)
     refined = K.copy()
-    refined[[0, 1], [0, 1]] *= 1 + found[0]
+    refined[[0, 1], [0, 1]] *= 1 + state[0]
     source = f"{start.source}, refined on {len(bundles)} windows"
-    return Calibration(refined, found[1:], size, source)
+    return Calibration(refined, state[1:], size, source)
 
 
 def _folds(distortion: Array, corner: Array) -> bool:
@@ -217,7 +225,7 @@ def _folds(distortion: Array, corner: Array) -> bool:
 
 def _optimise(
     bundles: list[Bundle], prior: Array, unit: float, workers: ThreadPoolExecutor
-) -> Array | None:
+) -> tuple[Array, Array] | None:
     """Gauss-Newton on relative focal length, k1, k2, everything else adjusted in each round.
 
     Args:
@@ -227,7 +235,8 @@ def _optimise(
         workers: threads.
 
     Returns:
-        (3,); None: it does not converge.
+        (3,), and its (3, 3) covariance by how much the windows disagree; None: it does not
+        converge.
     """
     given = bundles[0].intrinsics.copy()
     state = np.zeros(3)
@@ -254,7 +263,10 @@ def _optimise(
         if np.abs(state).max() > MAX_STATE:
             return None
         if np.abs(step).max() < SETTLED:
-            return state if costs[-1] <= costs[0] * (1 + SLACK) else None
+            if costs[-1] > costs[0] * (1 + SLACK):
+                return None
+            pulls = np.linalg.solve(H, np.stack([term[1] for term in terms]).T)
+            return state, pulls @ pulls.T
     return None
 
 
