@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 BISECTIONS = 30
 MAX_ZOOM = 3.0
+HALF_PX = 0.49  # of a pixel around its centre, so that its nearest pixel lies inside too
 NEGLIGIBLE_PX = 0.02  # distortion below it is not worth a resampling
 
 
@@ -151,7 +152,7 @@ def _zoom(lens: Array, distortion: Array, size: tuple[int, int]) -> float:
         pinhole[0, 0] *= zoom
         pinhole[1, 1] *= zoom
         source = _source_pixels(lens, pinhole, distortion, border)
-        return bool(np.all((source > -0.5) & (source < limits + 0.5)))
+        return bool(np.all((source > -HALF_PX) & (source < limits + HALF_PX)))
 
     low, high = 1.0, MAX_ZOOM
     if fits(low):

@@ -1,9 +1,12 @@
 """The pinhole camera: projection inverts unprojection, and resizing moves no ray."""
 
+import cv2
 import numpy as np
 import pytest
 
 from laser_slam.camera import (
+    distort,
+    guess_intrinsics,
     intrinsics_from_fov,
     intrinsics_matrix,
     project,
@@ -80,3 +83,19 @@ def test_the_field_of_view_spans_the_image(fov_deg: float) -> None:
     assert intrinsics[0, 0] == intrinsics[1, 1]
     middle = np.linalg.solve(intrinsics, [(WIDTH - 1) / 2, (HEIGHT - 1) / 2, 1])
     np.testing.assert_allclose(middle, [0, 0, 1], atol=1e-12)
+
+
+def test_distortion_is_that_of_opencv() -> None:
+    slopes = np.random.default_rng(0).uniform(-1, 1, (50, 2))
+    distortion = np.array([-0.21, 0.07])
+    points = np.column_stack([slopes, np.ones(50)])
+    lens = np.array([*distortion, 0.0, 0.0])
+    theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), lens)[0]
+    np.testing.assert_allclose(distort(slopes, distortion), theirs.reshape(-1, 2), atol=1e-12)
+    np.testing.assert_array_equal(distort(slopes, np.zeros(2)), slopes)
+
+
+def test_a_guess_has_square_pixels_and_its_centre_in_the_middle() -> None:
+    guess = guess_intrinsics(100, 201, 0.5)
+    np.testing.assert_array_equal(guess, intrinsics_matrix(100.5, 100.5, 100.0, 49.5))
+    assert 0.4 < guess_intrinsics(100, 200)[0, 0] / 200 < 1.0

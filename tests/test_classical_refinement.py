@@ -50,7 +50,7 @@ def street_bundle(drive: RenderedDrive) -> tuple[Bundle, NDArray[np.float32]]:
     rays = np.linalg.solve(drive.intrinsics, np.vstack([corners.T, np.ones(len(x))])).T
     world_from_cam = drive.world_from_cam[middle]
     points = (rays * z[:, None]) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
-    cam_from_world: Array = np.linalg.inv(drive.world_from_cam[list(FRAMES)])
+    cam_from_world = np.asarray(np.linalg.inv(drive.world_from_cam[list(FRAMES)]), np.float64)
     R, t = cam_from_world[:, :3, :3].copy(), cam_from_world[:, :3, 3].copy()
     images = blurred([drive.greys[frame] for frame in FRAMES])
     return make_bundle(R, t, points, pixels, drive.intrinsics), images

@@ -55,8 +55,8 @@ class Drive:
         rng = np.random.default_rng(self.seed)
         x, z = rng.uniform(-25, 25, self.num_points), rng.uniform(-2, 45, self.num_points)
         points = np.stack([x, rng.uniform(-6, 1.7, self.num_points), z], axis=1)
-        around = self.rotations[-1].T @ points[: self.num_points // 2].T
-        points[: self.num_points // 2] = around.T + self.centres[-1]
+        ahead = slice(self.num_points // 2)
+        points[ahead] = points[ahead] @ self.rotations[-1] + self.centres[-1]
         return np.asarray(points)
 
     def true_pixels(self, frame: int) -> tuple[Array, Array]:
