@@ -65,7 +65,7 @@ class ClassicalConfig(_Section):
     num_features: int = Field(1000, ge=100, description="corners per frame")
     max_backward_px: float = Field(0.7, gt=0, description="forward-backward gap of a good track")
     refine_radius: int = Field(
-        5, ge=0, le=10, description="half side of the patches that are aligned, px; 0: none are"
+        5, ge=0, le=10, description="half side of aligned patches, px at 1280 wide; 0: none are"
     )
     context: int = Field(15, ge=0, description="earlier keyframes that steady a window's solution")
     depth_width: int = Field(640, ge=96, description="width of the depth maps, px")

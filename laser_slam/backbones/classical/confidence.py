@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from laser_slam.backbones.classical.confidence_kernels import ask
 from laser_slam.backbones.classical.sweep import MEDIAN_SIDE, Float, Sweep, View
@@ -59,8 +60,15 @@ def _confidence(views: list[View], sweeps: list[Sweep | None], frame: int, K: Ar
     unique = _smooth(np.clip(own.uniqueness / UNIQUE_BITS, 0, 1))
     match = _smooth(np.clip((WORST_COST - own.cost) / COST_RANGE, 0, 1))
     out = geometry * consistency**1.5 * np.sqrt(unique * match)
-    out[own.is_far] = 0
+    out[_near_sky(own.is_far)] = 0
     return np.asarray(out, np.float32)
+
+
+def _near_sky(is_far: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Widen the sky by the matching patch: its colour clings to the edges of what is before it."""
+    solid = cv2.medianBlur(is_far.astype(np.uint8), MEDIAN_SIDE)
+    patch = np.ones((MEDIAN_SIDE, MEDIAN_SIDE), np.uint8)
+    return is_far | (cv2.dilate(solid, patch) > 0)
 
 
 def _smooth(values: Float) -> Float:

@@ -25,6 +25,7 @@ PNP_ERROR_PX = 5.0  # at full width of 1280
 COARSE_ROUNDS = ((2.0, 6.0), (2.0, 3.0))  # Huber and limit, in pixels at full width of 1280
 FINE_ROUNDS = ((1.0, 3.0), (0.7, 1.5), (0.5, 1.5))
 ITERATIONS = 15
+MIN_RADIUS = 3  # pixels; a smaller patch is no pattern
 BLUR_PX = 0.7  # of the images whose patches are aligned
 LOCAL_ADJUSTMENTS = {1, 3, 6, 10, 14}  # frames after the start at which the window is adjusted
 
@@ -190,8 +191,8 @@ class Solver:
         """Adjust in rounds, each with less tolerance; measure the tracks again in between.
 
         Args:
-            refine_radius: half side in pixels of the patches that are aligned at full
-                resolution; 0: the tracks stay as they are.
+            refine_radius: half side of the patches that are aligned at full resolution, in
+                pixels at full width of 1280; 0: the tracks stay as they are.
 
         Returns:
             What is left; None: too little to be a reconstruction.
@@ -201,9 +202,10 @@ class Solver:
         bundle, ids = self.bundle(8.0)
         ids = self._settle(bundle, ids, COARSE_ROUNDS)
         if refine_radius:
+            radius = max(MIN_RADIUS, round(refine_radius * self._unit))
             greys = [view.grey.astype(np.float32) for view in self._views]
             blurred = np.stack([cv2.GaussianBlur(grey, (0, 0), BLUR_PX) for grey in greys])
-            ids = ids[bundle.select(refine(bundle, blurred, refine_radius), MIN_VIEWS)]
+            ids = ids[bundle.select(refine(bundle, blurred, radius), MIN_VIEWS)]
             ids = self._settle(bundle, ids, FINE_ROUNDS)
         ids = self._drop_loose_views(bundle, ids)
         is_finite = np.isfinite(self.translations).all() and np.isfinite(bundle.points).all()
