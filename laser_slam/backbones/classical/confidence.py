@@ -68,7 +68,7 @@ def _near_sky(is_far: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Widen the sky by the matching patch: its colour clings to the edges of what is before it."""
     solid = cv2.medianBlur(is_far.astype(np.uint8), MEDIAN_SIDE)
     patch = np.ones((MEDIAN_SIDE, MEDIAN_SIDE), np.uint8)
-    return is_far | (cv2.dilate(solid, patch) > 0)
+    return np.asarray(is_far | (cv2.dilate(solid, patch) > 0))
 
 
 def _smooth(values: Float) -> Float:
