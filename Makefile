@@ -1,19 +1,22 @@
-.PHONY: setup demo test check clean
+VENV ?= .venv
 
-setup:  ## virtual environment in .venv, system libraries for Open3D
-	tools/setup.sh
+.PHONY: setup demo test lint check clean
+
+setup:  ## virtual environment in $(VENV), system libraries for Open3D
+	tools/setup.sh $(VENV)
 
 demo: setup  ## a generated drive through the whole system
-	.venv/bin/laser-slam demo
+	$(VENV)/bin/laser-slam demo
 
 test: setup  ## the tests
-	.venv/bin/python -m pytest
+	$(VENV)/bin/python -m pytest
 
-check: setup  ## style, types and tests
-	.venv/bin/ruff check
-	.venv/bin/ruff format --check
-	.venv/bin/mypy
-	.venv/bin/python -m pytest
+lint: setup  ## style and types
+	$(VENV)/bin/ruff check
+	$(VENV)/bin/ruff format --check
+	$(VENV)/bin/mypy
+
+check: lint test  ## all of it, as the continuous integration does
 
 clean:  ## remove the virtual environment
-	rm -rf .venv
+	rm -rf $(VENV)
