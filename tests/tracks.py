@@ -48,7 +48,7 @@ class Drive:
 
     @cached_property
     def translations(self) -> Array:
-        return -np.einsum("cij,cj->ci", self.rotations, self.centres)
+        return np.asarray(-np.einsum("cij,cj->ci", self.rotations, self.centres))
 
     @cached_property
     def points(self) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import poselib
@@ -104,7 +103,7 @@ def relative_pose(
     """Estimate second_from_first by RANSAC on the essential matrix.
 
     Returns:
-        (3, 3) rotation, (3,) unit translation, number of inliers (0: no pose).
+        (3, 3) rotation, (3,) unit translation, number of inliers.
     """
     a, b, _ = match(first, second)
     camera = camera_dict(intrinsics)
@@ -112,7 +111,7 @@ def relative_pose(
     pose, info = poselib.estimate_relative_pose(a, b, camera, camera, options, {})
     translation = np.asarray(pose.t, dtype=np.float64)
     length = max(float(np.linalg.norm(translation)), 1e-12)
-    return np.asarray(pose.R), translation / length, _num_inliers(pose, info)
+    return np.asarray(pose.R), translation / length, int(info["num_inliers"])
 
 
 def absolute_pose(
@@ -121,16 +120,10 @@ def absolute_pose(
     """Estimate cam_from_window from (N, 2) pixels of (N, 3) points by RANSAC.
 
     Returns:
-        (3, 3) rotation, (3,) translation, number of inliers (0: no pose).
+        (3, 3) rotation, (3,) translation, number of inliers; with none, the pose is NaN.
     """
     options = {"max_reproj_error": max_error_px, "seed": 0, "max_iterations": 1000}
     pose, info = poselib.estimate_absolute_pose(
         pixels, points, camera_dict(intrinsics), options, {}
     )
-    return np.asarray(pose.R), np.asarray(pose.t), _num_inliers(pose, info)
-
-
-def _num_inliers(pose: poselib.CameraPose, info: dict[str, Any]) -> int:
-    """Return how many measurements agree with a pose; where all fail, poselib's pose is NaN."""
-    is_pose = np.isfinite(pose.R).all() and np.isfinite(pose.t).all()
-    return int(info["num_inliers"]) if is_pose else 0
+    return np.asarray(pose.R), np.asarray(pose.t), int(info["num_inliers"])
