@@ -20,9 +20,11 @@ from laser_slam.config import BackboneConfig
 from laser_slam.sim3 import Array
 from laser_slam.types import Calibration, Image, Prediction, Window
 
-MAX_WINDOW = 128  # keyframes
 MIN_KNOWN = 3  # frames with poses that a window can go on from
-MIN_PLACED = 0.25  # share of a window's frames that make it worth its depth
+ENOUGH_PLACED = 0.5  # share of a window's frames with which it may go on from the one before
+MIN_PLACED = 0.25  # share that makes a window worth its depth
+
+Poses = dict[int, tuple[Array, Array]]  # of some frames: cam_from_window
 
 
 class ClassicalBackbone:
@@ -30,15 +32,19 @@ class ClassicalBackbone:
 
     It remembers the tracks and poses of the last frames: a window that continues the one before is
     solved together with that context, which keeps its scale. Any other window starts afresh.
+
+    Attributes:
+        remembers: True, see `laser_slam.backbones.base.Backbone`.
     """
+
+    remembers = True
 
     def __init__(self, config: BackboneConfig) -> None:
         self._config = config.classical
         self._workers = ThreadPoolExecutor(os.cpu_count() or 1)
-        self._tracker = self._new_tracker()
-        self._poses: dict[
-            int, tuple[Array, Array]
-        ] = {}  # frame: cam_from_window, last window's axes
+        self._longest = 0  # frames of a window, for which there is memory
+        self._tracker = Tracker(self._config, memory=0)
+        self._poses: Poses = {}  # in the axes and the unit of the last window's solution
 
     def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return the (height, width) at which it wants images of (height, width) ``size``."""
@@ -60,36 +66,75 @@ class ClassicalBackbone:
         K = guess_intrinsics(*images[0].shape[:2]) if intrinsics is None else intrinsics
         views = self._track(images, frames)
         window = views[-len(frames) :]
-        for used in (views, window):  # where the context does not carry on, without it
-            solution = self._reconstruct(used, K)
-            if solution is None or solution.has_pose[-len(frames) :].mean() < MIN_PLACED:
-                continue
-            self._poses = solution.poses_of([view.frame for view in used])
-            return with_depth(used, solution, frames, K, self._config, self._workers)
+        solved = self._solve(views, window, K)
         self._poses = {}
+        if solved is not None:
+            used, solution = solved
+            prediction = with_depth(used, solution, frames, K, self._config, self._workers)
+            if prediction.confidence.any():
+                self._poses = solution.poses_of([view.frame for view in used])
+                return prediction
         return without_depth(window, frames, K, self._config)
-
-    def _new_tracker(self) -> Tracker:
-        return Tracker(self._config, self._config.context + MAX_WINDOW)
 
     def _track(self, images: Sequence[Image], frames: NDArray[np.int64]) -> list[FrameTracks]:
         """Track what is new; return the context and the window."""
-        known = {view.frame for view in self._tracker.history}
-        if int(frames[0]) not in known:
-            self._tracker, self._poses, known = self._new_tracker(), {}, set()
-        for frame, image in zip(frames, images, strict=True):
-            if int(frame) not in known:
-                self._tracker.add(int(frame), cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-        history = [view for view in self._tracker.history if view.frame <= frames[-1]]
-        first = next(i for i, view in enumerate(history) if view.frame == frames[0])
-        return history[max(0, first - self._config.context) :]
+        greys = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
+        num_known = _num_continued(self._tracker.history, greys, frames)
+        if num_known == 0 or len(frames) > self._longest:
+            num_known, self._longest = 0, len(frames)
+            self._tracker = Tracker(self._config, memory=self._config.context + len(frames))
+            self._poses = {}
+        for frame, grey in zip(frames[num_known:], greys[num_known:], strict=True):
+            self._tracker.add(int(frame), grey)
+        return self._tracker.history[-(self._config.context + len(frames)) :]
 
-    def _reconstruct(self, views: list[FrameTracks], K: Array) -> Reconstruction | None:
-        solver = Solver(views, K)
-        known = {i: self._poses[v.frame] for i, v in enumerate(views) if v.frame in self._poses}
-        if len(known) >= MIN_KNOWN:
-            solver.start_from_known(known)
-        elif not solver.start_from_pair():
-            return None
-        solver.grow()
-        return solver.finish(self._config.refine_radius)
+    def _solve(
+        self, views: list[FrameTracks], window: list[FrameTracks], K: Array
+    ) -> tuple[list[FrameTracks], Reconstruction] | None:
+        """Go on from the known poses, which keeps the scale; where that places few, start afresh.
+
+        Returns:
+            The frames that are reconstructed, of which the last are the window, and how.
+        """
+        known: Poses = {
+            i: self._poses[v.frame] for i, v in enumerate(views) if v.frame in self._poses
+        }
+        attempts: list[tuple[list[FrameTracks], Poses]] = [(views, known)]
+        if known or len(views) > len(window):
+            attempts.append((window, {}))
+        best, most = None, MIN_PLACED
+        for used, start in attempts:
+            solution = _reconstruct(used, start, K, self._config.refine_radius)
+            share = 0.0 if solution is None else float(solution.has_pose[-len(window) :].mean())
+            if solution is not None and share > most:
+                best, most = (used, solution), share
+            if most >= ENOUGH_PLACED:
+                break
+        return best
+
+
+def _num_continued(
+    history: list[FrameTracks], greys: list[NDArray[np.uint8]], frames: NDArray[np.int64]
+) -> int:
+    """Return how many frames a window shares with the last ones seen; 0: it does not go on there.
+
+    It goes on if it begins with exactly the last frames seen, unchanged, and has others after them.
+    """
+    shared = [view for view in history if view.frame >= frames[0]]
+    num = len(shared)
+    if num >= len(frames) or [view.frame for view in shared] != list(frames[:num]):
+        return 0
+    is_same = all(np.array_equal(v.grey, g) for v, g in zip(shared, greys, strict=False))
+    return num if is_same else 0
+
+
+def _reconstruct(
+    views: list[FrameTracks], known: Poses, K: Array, radius: int
+) -> Reconstruction | None:
+    solver = Solver(views, K)
+    if len(known) >= MIN_KNOWN:
+        solver.start_from_known(known)
+    elif not solver.start_from_pair():
+        return None
+    solver.grow()
+    return solver.finish(radius)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.backbones.classical.dense import PosedFrames, dense_depth, depth_size
-from laser_slam.backbones.classical.reconstruction import Reconstruction
+from laser_slam.backbones.classical.reconstruction import Reconstruction, collect
 from laser_slam.backbones.classical.tracking import FrameTracks
 from laser_slam.backbones.classical.twoview import MIN_MATCHES, measure_motion
 from laser_slam.camera import resize_intrinsics
@@ -17,8 +17,12 @@ from laser_slam.config import ClassicalConfig
 from laser_slam.sim3 import Array, complete_poses
 from laser_slam.types import Prediction, WindowStatus
 
-STILL_PX = 1.5  # flow at 640 wide between two frames; below, the camera stands
-TURNING_PX = 1.5  # parallax at 640 wide between two frames; below, the camera only turns
+STILL_PX = 1.5  # flow at 640 wide over a window; below, the camera stands
+TURNING_PX = 1.5  # parallax at 640 wide over a window; below, the camera only turns ...
+TURNING_SHARE = 0.05  # ... or parallax per flow: intrinsics are never exact
+MIN_ANCHORED = 60  # matches; with fewer, flow is measured from a later frame
+MOVED_PX = 4.0  # of a track, at 640 wide; what moves less fits anything
+FEW_FIT = 0.65  # share of the tracks that fit a static scene; less is worth a warning
 
 
 def with_depth(
@@ -53,15 +57,30 @@ def with_depth(
     known = np.array([views[posed[i]].frame for i in wanted])
     slots = np.searchsorted(frames, known)
     poses = complete_poses(frames, known, _cam_to_window(scene, wanted, unit))
-    missing = len(frames) - len(known)
     return Prediction(
         frames,
         _spread(depth / unit, slots, len(frames), np.nan),
         _spread(confidence, slots, len(frames), 0.0),
         np.linalg.inv(poses[0]) @ poses,
         np.tile(depth_K, (len(frames), 1, 1)),
-        warnings=(f"{missing} of {len(frames)} frames could not be placed",) if missing else (),
+        warnings=_warnings(views, solution, len(frames)),
     )
+
+
+def _warnings(views: list[FrameTracks], solution: Reconstruction, num: int) -> tuple[str, ...]:
+    """Say what a person should know of a window, the last ``num`` of the views."""
+    missing = num - int(solution.has_pose[-num:].sum())
+    out = [f"{missing} of {num} frames could not be placed"] if missing else []
+    tracks = collect([views[c] for c in np.flatnonzero(solution.has_pose)])
+    starts = tracks.starts[:-1]
+    highest = np.maximum.reduceat(tracks.pixels, starts)
+    spread = highest - np.minimum.reduceat(tracks.pixels, starts)
+    unit = views[0].grey.shape[1] / 640
+    did_move = tracks.ids[spread.max(axis=1) > MOVED_PX * unit]
+    share = float(np.isin(did_move, solution.ids).mean()) if len(did_move) else 1.0
+    if share < FEW_FIT:
+        out.append(f"only {share:.0%} of the tracks fit a static scene")
+    return tuple(out)
 
 
 def _cam_to_window(scene: PosedFrames, wanted: list[int], unit: float) -> Array:
@@ -82,6 +101,45 @@ def _spread(
     return out
 
 
+@dataclass(frozen=True)
+class Turn:
+    """How a camera turned over a window, if turning is all it did.
+
+    Attributes:
+        window_from_cam: (N, 3, 3) rotations.
+        flow_px: the longest median flow between any frame and the one it was measured from.
+        parallax_px: the largest flow that neither the rotation nor a camera that is slightly
+            other than thought explains.
+    """
+
+    window_from_cam: Array
+    flow_px: float
+    parallax_px: float
+
+
+def follow_turn(views: list[FrameTracks], K: Array) -> Turn | None:
+    """Measure rotation, flow and parallax over as many frames as the tracks last.
+
+    A slow motion hides between neighbours, not over a window.
+
+    Returns:
+        None: some frames have too few tracks in common, or there is one frame only.
+    """
+    rotations, flow, parallax = [np.eye(3)], 0.0, 0.0
+    anchor = 0
+    for i in range(1, len(views)):
+        motion = measure_motion(views[anchor], views[i], K)
+        if motion.num_matches < MIN_ANCHORED and anchor < i - 1:
+            anchor = i - 1
+            motion = measure_motion(views[anchor], views[i], K)
+        if motion.num_matches < MIN_MATCHES:
+            return None
+        rotations.append(rotations[anchor] @ motion.second_from_first.T)
+        flow = max(flow, motion.flow_px)
+        parallax = max(parallax, motion.parallax_px - TURNING_SHARE * motion.flow_px)
+    return Turn(np.stack(rotations), flow, parallax) if len(views) > 1 else None
+
+
 def without_depth(
     views: list[FrameTracks], frames: NDArray[np.int64], K: Array, config: ClassicalConfig
 ) -> Prediction:
@@ -95,16 +153,14 @@ def without_depth(
     """
     height, width = views[0].grey.shape
     unit = width / 640
-    motions = [measure_motion(first, second, K) for first, second in pairwise(views)]
+    turn = follow_turn(views, K)
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
     status = WindowStatus.FAILED
-    is_seen = all(motion.num_matches >= MIN_MATCHES for motion in motions)
-    if is_seen and max(motion.flow_px for motion in motions) < STILL_PX * unit:
+    if turn is not None and turn.flow_px < STILL_PX * unit:
         status = WindowStatus.STATIC
-    elif is_seen and max(motion.parallax_px for motion in motions) < TURNING_PX * unit:
+    elif turn is not None and turn.parallax_px < TURNING_PX * unit:
         status = WindowStatus.ROTATION
-        for i, motion in enumerate(motions):
-            poses[i + 1, :3, :3] = poses[i, :3, :3] @ motion.second_from_first.T
+        poses[:, :3, :3] = turn.window_from_cam
     size = depth_size((height, width), config.depth_width)
     depth = np.full((len(frames), *size), np.nan, np.float32)
     depth_K = np.tile(resize_intrinsics(K, (height, width), size), (len(frames), 1, 1))

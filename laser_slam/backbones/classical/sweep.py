@@ -18,10 +18,6 @@ from laser_slam.backbones.classical.sweep_kernels import (
 from laser_slam.sim3 import Array
 
 BASELINES = (0.05, 0.10)  # of the neighbours, in median depths; wider ones lose to occlusion
-JUMP_PENALTY, JUMP_FLOOR = (
-    np.float32(60.0),
-    np.float32(9.0),
-)  # for a larger one; less at image edges
 MEDIAN_SIDE = 5  # pixels, of the filter over the winners
 
 Float = NDArray[np.float32]
