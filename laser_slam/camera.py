@@ -83,11 +83,16 @@ def project(points: Array, intrinsics: Array) -> Array:
 
 
 def distort(slopes: Array, distortion: Array) -> Array:
-    """Return the slopes at which a lens with radial distortion shows rays.
+    """Bend rays as a lens does.
 
     Args:
-        slopes: (..., 2) x / z and y / z of the rays.
-        distortion: (2,) k1, k2 as OpenCV defines them.
+        slopes: (..., 2) x / z and y / z.
+        distortion: (4,) radial k1, k2 and tangential p1, p2 as OpenCV defines them.
     """
-    r2 = (slopes**2).sum(axis=-1, keepdims=True)
-    return np.asarray(slopes * (1 + r2 * (distortion[0] + r2 * distortion[1])))
+    k1, k2, p1, p2 = distortion
+    x, y = slopes[..., 0], slopes[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * k2)
+    bent_x = radial * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    bent_y = radial * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.stack([bent_x, bent_y], axis=-1)

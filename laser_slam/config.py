@@ -52,7 +52,7 @@ class CalibrationConfig(_Section):
     """What the run learns of the camera before it starts."""
 
     keyframes: int = Field(
-        320, ge=0, description="first keyframes that calibrate the camera; 0: taken as given"
+        480, ge=0, description="first keyframes that calibrate the camera; 0: taken as given"
     )
 
 

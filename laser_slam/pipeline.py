@@ -49,7 +49,16 @@ from laser_slam.store import (
     open_run_folder,
     save_prediction,
 )
-from laser_slam.types import Calibration, Cloud, Image, Prediction, Submap, Trajectory, Window
+from laser_slam.types import (
+    NO_DISTORTION,
+    Calibration,
+    Cloud,
+    Image,
+    Prediction,
+    Submap,
+    Trajectory,
+    Window,
+)
 from laser_slam.windows import cut_windows, select_keyframes
 
 Progress = Callable[[str, int, int | None], None]
@@ -97,7 +106,7 @@ class Pipeline:
         self._slam = Slam(config)
         self._size = self.backbone.image_size(self._info.size)
         self._calibration = Calibration(
-            self._given(), np.zeros(2), self._size, self._info.intrinsics_source
+            self._given(), NO_DISTORTION, self._size, self._info.intrinsics_source
         )
         self._rectifier = Rectifier(self._calibration, self._size)
         self._input = FrameLog()
@@ -153,7 +162,7 @@ class Pipeline:
         with closing(self._dataset.frames()) as frames:
             keyframes = select_keyframes(frames, config, info.intrinsics, info.size)
             first = islice(keyframes, self._config.calibration.keyframes)
-            as_seen = Calibration(None, np.zeros(2), self._size, "")
+            as_seen = Calibration(None, NO_DISTORTION, self._size, "")
             yield from cut_windows(first, config, Rectifier(as_seen, self._size).image)
 
     def _given(self) -> NDArray[np.float64] | None:

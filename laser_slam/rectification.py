@@ -102,7 +102,7 @@ def load_calibration(path: Path) -> Calibration:
         height, width = content["size"]
         calibration = Calibration(
             None if K is None else np.array(K, np.float64).reshape(3, 3),
-            np.array(content["distortion"], np.float64).reshape(2),
+            np.array(content["distortion"], np.float64).reshape(4),
             (int(height), int(width)),
             str(content["source"]),
         )
@@ -158,7 +158,7 @@ def _zoom(lens: Array, distortion: Array, size: tuple[int, int]) -> float:
     if fits(low):
         return low
     if not fits(high):
-        k1, k2 = distortion
+        k1, k2 = distortion[:2]
         raise DegenerateGeometryError(
             f"no lens has the distortion k1 = {k1:.3g}, k2 = {k2:.3g}: correct the calibration"
         )

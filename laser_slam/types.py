@@ -12,6 +12,9 @@ from laser_slam.sim3 import Sim3
 
 Image = NDArray[np.uint8]
 
+NO_DISTORTION: NDArray[np.float64] = np.zeros(4)
+NO_DISTORTION.setflags(write=False)
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -80,7 +83,7 @@ class Calibration:
 
     Attributes:
         intrinsics: (3, 3) in pixels; None: unknown, the backbone finds its own for each window.
-        distortion: (2,) radial k1, k2 as OpenCV defines them.
+        distortion: (4,) radial k1, k2 and tangential p1, p2 as OpenCV defines them.
         size: (height, width) of the images that it is for.
         source: where it comes from, in words.
     """

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from laser_slam.camera import intrinsics_from_fov, rays
 from laser_slam.sim3 import Sim3, rotation_exp
 from laser_slam.types import (
+    NO_DISTORTION,
     Calibration,
     Frame,
     Image,
@@ -124,7 +125,7 @@ class TrueBackbone:
     def calibrate(
         self, windows: Iterable[Window], intrinsics: NDArray[np.float64] | None
     ) -> Calibration:
-        return Calibration(intrinsics, np.zeros(2), SIZE, "given")
+        return Calibration(intrinsics, NO_DISTORTION, SIZE, "given")
 
     def predict(
         self,

@@ -87,12 +87,11 @@ def test_the_field_of_view_spans_the_image(fov_deg: float) -> None:
 
 def test_distortion_is_that_of_opencv() -> None:
     slopes = np.random.default_rng(0).uniform(-1, 1, (50, 2))
-    distortion = np.array([-0.21, 0.07])
+    distortion = np.array([-0.21, 0.07, 0.003, -0.02])
     points = np.column_stack([slopes, np.ones(50)])
-    lens = np.array([*distortion, 0.0, 0.0])
-    theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), lens)[0]
+    theirs = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), distortion)[0]
     np.testing.assert_allclose(distort(slopes, distortion), theirs.reshape(-1, 2), atol=1e-12)
-    np.testing.assert_array_equal(distort(slopes, np.zeros(2)), slopes)
+    np.testing.assert_array_equal(distort(slopes, np.zeros(4)), slopes)
 
 
 def test_a_guess_has_square_pixels_and_its_centre_in_the_middle() -> None:

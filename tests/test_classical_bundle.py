@@ -8,11 +8,15 @@ from tracks import Drive, camera_centres
 
 from laser_slam.backbones.classical.bundle import Bundle
 from laser_slam.backbones.classical.bundle_kernels import eliminate_points, linearise
-from laser_slam.backbones.classical.calibration_kernels import shared_equations, shared_jacobian
+from laser_slam.backbones.classical.calibration_kernels import (
+    NUM_SHARED,
+    shared_equations,
+    shared_jacobian,
+)
 from laser_slam.sim3 import Array, rotation_exp, rotation_log
 
 DRIVE = Drive(num_frames=10, turn_deg=20, num_points=600)
-LENS = np.array([700.0, 710.0, 600.0, 180.0, -0.2, 0.08])
+LENS = np.array([700.0, 710.0, 600.0, 180.0, -0.2, 0.08, 0.004, -0.02])
 NO_LOSS = 1e9  # pixels: the Huber loss stays quadratic
 
 
@@ -56,7 +60,7 @@ def test_poses_and_points_come_back_exactly_without_noise(seed: int) -> None:
 
 
 def test_distorted_tracks_need_the_lens_and_then_give_the_truth() -> None:
-    drive = replace(DRIVE, noise_px=0.0, distortion=np.array([-0.1, 0.03]))
+    drive = replace(DRIVE, noise_px=0.0, distortion=np.array([-0.1, 0.03, 0.002, -0.003]))
     bundle, _ = drive.bundle(fixed=(0, 9))
     shake(bundle)
     for _ in range(3):
@@ -154,7 +158,10 @@ def project(R: Array, t: Array, point: Array, lens: Array) -> Array:
     x, y, z = R @ point + t
     slope = np.array([x, y]) / z
     r2 = slope @ slope
-    return np.asarray(lens[:2] * slope * (1 + lens[4] * r2 + lens[5] * r2**2) + lens[2:4])
+    radial = slope * (1 + lens[4] * r2 + lens[5] * r2**2)
+    swapped = 2 * slope.prod() * lens[6:]
+    tangential = swapped + lens[[7, 6]] * (r2 + 2 * slope**2)
+    return np.asarray(lens[:2] * (radial + tangential) + lens[2:4])
 
 
 def derivative(function: object, num: int, step: float = 1e-6) -> Array:
@@ -165,15 +172,16 @@ def derivative(function: object, num: int, step: float = 1e-6) -> Array:
 
 
 def numeric_jacobians(R: Array, t: Array, X: Array, lens: Array) -> tuple[Array, Array, Array]:
-    """By pose (rotation, translation), point, and (relative focal length, k1, k2)."""
+    """By pose (rotation, translation), point, and the seven shared unknowns."""
 
     def calibrated(d: Array) -> Array:
-        return np.concatenate([lens[:2] * (1 + d[0]), lens[2:4], lens[4:] + d[1:]])
+        centre = lens[2:4] + lens[:2] * d[1:3]
+        return np.concatenate([lens[:2] * (1 + d[0]), centre, lens[4:] + d[3:]])
 
     return (
         derivative(lambda d: project(rotation_exp(d[:3]) @ R, t + d[3:], X, lens), 6),
         derivative(lambda d: project(R, t, X + d, lens), 3),
-        derivative(lambda d: project(R, t, X, calibrated(d)), 3),
+        derivative(lambda d: project(R, t, X, calibrated(d)), NUM_SHARED),
     )
 
 
@@ -186,7 +194,7 @@ def test_jacobians_are_those_of_numeric_differentiation(seed: int, error_px: flo
     X = R.T @ (np.array([*rng.uniform(-3, 3, 2), 6.0]) - t)
     offset = rng.normal(size=2)
     pixel = project(R, t, X, LENS) - error_px * offset / np.linalg.norm(offset)
-    J_cam, J_point, J = np.zeros((2, 6)), np.zeros((2, 3)), np.zeros((2, 3))
+    J_cam, J_point, J = np.zeros((2, 6)), np.zeros((2, 3)), np.zeros((2, NUM_SHARED))
     r = np.zeros(2)
     linearise(R, t, X, pixel, LENS, huber, J_cam, J_point, r)
     x, y, z = R @ X + t
@@ -203,16 +211,17 @@ def test_equations_without_points_are_those_of_dense_elimination() -> None:
     bundle, _ = drive.bundle()
     bundle.intrinsics = LENS
     num_cams, num = 4, len(bundle.points)
-    J = np.zeros((2 * len(bundle.cameras), 6 * num_cams + 3 + 3 * num))
+    J = np.zeros((2 * len(bundle.cameras), 6 * num_cams + NUM_SHARED + 3 * num))
     r = np.zeros(2 * len(bundle.cameras))
     for o, (c, p) in enumerate(zip(bundle.cameras, bundle.point_of, strict=True)):
         R, t, X = bundle.rotations[c], bundle.translations[c], bundle.points[p]
-        rows, start = slice(2 * o, 2 * o + 2), 6 * num_cams + 3 + 3 * p
+        rows, start = slice(2 * o, 2 * o + 2), 6 * num_cams + NUM_SHARED + 3 * p
         by_pose, by_point, by_lens = numeric_jacobians(R, t, X, LENS)
         J[rows, 6 * c : 6 * c + 6], J[rows, start : start + 3] = by_pose, by_point
-        J[rows, 6 * num_cams : 6 * num_cams + 3] = by_lens
+        J[rows, 6 * num_cams : 6 * num_cams + NUM_SHARED] = by_lens
         r[rows] = project(R, t, X, LENS) - bundle.pixels[o]
-    A, B = J[:, : 6 * num_cams + 3], J[:, 6 * num_cams + 3 :]
+    shared_end = 6 * num_cams + NUM_SHARED
+    A, B = J[:, :shared_end], J[:, shared_end:]
     rest = A - B @ np.linalg.solve(B.T @ B, B.T @ A)
     H, g = A.T @ rest, -rest.T @ r
     poses = bundle.rotations, bundle.translations

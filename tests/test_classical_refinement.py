@@ -24,7 +24,7 @@ def blurred(images: list[NDArray[np.uint8]]) -> NDArray[np.float32]:
 
 
 def flat(K: Array) -> Array:
-    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0.0, 0.0])
+    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.zeros(4)])
 
 
 def make_bundle(R: Array, t: Array, points: Array, pixels: Array, K: Array) -> Bundle:

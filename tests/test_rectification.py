@@ -15,14 +15,19 @@ from laser_slam.types import Calibration, Image
 
 SIZE = (192, 640)
 K = intrinsics_matrix(360.0, 370.0, 315.0, 100.0)
-LENSES = [(-0.3, 0.05), (-0.1, 0.0), (0.12, 0.0), (0.1, 0.06)]
+LENSES = [
+    (-0.3, 0.05, 0.0, 0.0),
+    (-0.1, 0.0, 0.002, -0.003),
+    (0.12, 0.0, 0.0, 0.0),
+    (0.1, 0.06, -0.001, 0.004),
+]
 
 
-def camera(lens: tuple[float, float], size: tuple[int, int] = SIZE) -> Calibration:
+def camera(lens: tuple[float, ...], size: tuple[int, int] = SIZE) -> Calibration:
     return Calibration(K, np.array(lens), size, "made up")
 
 
-def seen_slopes(lens: tuple[float, float], size: tuple[int, int] = SIZE) -> Array:
+def seen_slopes(lens: tuple[float, ...], size: tuple[int, int] = SIZE) -> Array:
     """Return the (H, W, 2) slopes x / z, y / z of what each pixel of the distorted image shows."""
     x, y = np.meshgrid(np.arange(size[1]), np.arange(size[0]))
     shown = (np.stack([x, y], axis=-1) - K[:2, 2]) / K[[0, 1], [0, 1]]
@@ -51,7 +56,7 @@ def line_rows(image: Image) -> tuple[NDArray[np.int64], Array]:
 @pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize(("a", "b"), [(0.02, 0.12), (-0.05, -0.15)])
 def test_a_straight_line_is_straight_and_where_the_intrinsics_say(
-    lens: tuple[float, float], a: float, b: float
+    lens: tuple[float, ...], a: float, b: float
 ) -> None:
     image = line_image(seen_slopes(lens), a, b)
     columns, rows = line_rows(image)
@@ -69,7 +74,7 @@ def test_a_straight_line_is_straight_and_where_the_intrinsics_say(
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_no_pixel_comes_from_outside_the_image(lens: tuple[float, float]) -> None:
+def test_no_pixel_comes_from_outside_the_image(lens: tuple[float, ...]) -> None:
     """Each pixel of the image holds its own place; the places that come out are looked up."""
     x, y = np.meshgrid(np.arange(640.0), np.arange(192.0))
     rectifier = Rectifier(camera(lens), SIZE)
@@ -86,7 +91,7 @@ def test_no_pixel_comes_from_outside_the_image(lens: tuple[float, float]) -> Non
 
 
 @pytest.mark.parametrize("lens", [lens for lens in LENSES if lens[0] > 0])
-def test_no_more_is_cut_off_than_must_be(lens: tuple[float, float]) -> None:
+def test_no_more_is_cut_off_than_must_be(lens: tuple[float, ...]) -> None:
     new = Rectifier(camera(lens), SIZE).intrinsics
     assert new is not None
     corners = np.array([[0, 0], [639, 0], [0, 191], [639, 191.0]])
@@ -96,8 +101,8 @@ def test_no_more_is_cut_off_than_must_be(lens: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize("size", [SIZE, (96, 320), (150, 400), (288, 960)])
-@pytest.mark.parametrize("lens", [(0.0, 0.0), (1e-6, 0.0)])
-def test_no_distortion_is_a_plain_resize(size: tuple[int, int], lens: tuple[float, float]) -> None:
+@pytest.mark.parametrize("lens", [(0.0, 0.0, 0.0, 0.0), (1e-6, 0.0, 0.0, 0.0)])
+def test_no_distortion_is_a_plain_resize(size: tuple[int, int], lens: tuple[float, ...]) -> None:
     image = np.random.default_rng(0).integers(0, 255, (*SIZE, 3), dtype=np.uint8)
     rectifier = Rectifier(camera(lens), size)
     method = cv2.INTER_LINEAR if size[0] > SIZE[0] else cv2.INTER_AREA
@@ -120,15 +125,15 @@ def test_another_size_is_rectified_alike() -> None:
 
 def test_unknown_intrinsics_stay_unknown_and_images_are_resized() -> None:
     image = np.random.default_rng(0).integers(0, 255, (*SIZE, 3), dtype=np.uint8)
-    rectifier = Rectifier(Calibration(None, np.zeros(2), SIZE, "unknown"), (96, 320))
+    rectifier = Rectifier(Calibration(None, np.zeros(4), SIZE, "unknown"), (96, 320))
     assert rectifier.intrinsics is None
     assert rectifier.image(image).shape == (96, 320, 3)
 
 
-@pytest.mark.parametrize("lens", [(0.0, 0.0), LENSES[0]])
+@pytest.mark.parametrize("lens", [(0.0, 0.0, 0.0, 0.0), LENSES[0]])
 @pytest.mark.parametrize("size", [SIZE, (48, 160)])
 def test_depth_keeps_its_values_and_unknown_stays_unknown(
-    lens: tuple[float, float], size: tuple[int, int]
+    lens: tuple[float, ...], size: tuple[int, int]
 ) -> None:
     depth = np.random.default_rng(0).choice([2.0, 7.0, 30.0], SIZE).astype(np.float32)
     depth[:, :300] = np.nan
@@ -143,19 +148,21 @@ def test_depth_keeps_its_values_and_unknown_stays_unknown(
 def test_reduced_depth_is_that_of_the_pixels_middle() -> None:
     """A slope of depth shows half a pixel of shift."""
     depth = np.tile(np.arange(1, 641, dtype=np.float32), (192, 1))
-    out = Rectifier(camera((0.0, 0.0)), (64, 128)).depth(depth)
+    out = Rectifier(camera((0.0, 0.0, 0.0, 0.0)), (64, 128)).depth(depth)
     np.testing.assert_array_equal(out[0, :3], [3, 8, 13])
 
 
 def test_a_distortion_that_no_lens_has_is_refused() -> None:
     with pytest.raises(DegenerateGeometryError, match=r"no lens has .* k1 = 500.*calibration"):
-        Rectifier(camera((500.0, 0.0)), SIZE)
+        Rectifier(camera((500.0, 0.0, 0.0, 0.0)), SIZE)
 
 
 @pytest.mark.parametrize("intrinsics", [K, None])
 def test_a_calibration_comes_back_from_its_file(tmp_path: Path, intrinsics: Array | None) -> None:
     path = tmp_path / "calibration.yaml"
-    saved = Calibration(intrinsics, np.array([0.015936, -1 / 3]), SIZE, "given: refined, 19 “x”")
+    saved = Calibration(
+        intrinsics, np.array([0.015936, -1 / 3, 1e-4, -2e-3]), SIZE, "given: refined, 19 “x”"
+    )
     save_calibration(path, saved)
     loaded = load_calibration(path)
     np.testing.assert_equal(loaded.intrinsics, intrinsics)
@@ -163,7 +170,7 @@ def test_a_calibration_comes_back_from_its_file(tmp_path: Path, intrinsics: Arra
     assert (loaded.size, loaded.source) == (SIZE, saved.source)
 
 
-GOOD = "size: [192, 640]\nintrinsics: null\ndistortion: [0, 0]\nsource: x\n"
+GOOD = "size: [192, 640]\nintrinsics: null\ndistortion: [0, 0, 0, 0]\nsource: x\n"
 
 
 @pytest.mark.parametrize(
@@ -174,8 +181,8 @@ GOOD = "size: [192, 640]\nintrinsics: null\ndistortion: [0, 0]\nsource: x\n"
         "a list: of [things]",
         GOOD.replace("[192, 640]", "[192]"),
         GOOD.replace("[192, 640]", "[0, 640]"),
-        GOOD.replace("[0, 0]", "[0, 0, 0]"),
-        GOOD.replace("[0, 0]", "[0, .nan]"),
+        GOOD.replace("[0, 0, 0, 0]", "[0, 0]"),
+        GOOD.replace("[0, 0, 0, 0]", "[0, .nan, 0, 0]"),
         GOOD.replace("null", "[[1, 0], [0, 1]]"),
         GOOD.replace("null", "[[0, 0, 1], [0, 1, 1], [0, 0, 1]]"),
         GOOD.replace("source: x", ""),

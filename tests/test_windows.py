@@ -17,7 +17,7 @@ from laser_slam.datasets.kitti import KittiOdometry
 from laser_slam.errors import DegenerateGeometryError
 from laser_slam.rectification import Rectifier
 from laser_slam.sim3 import rotation_exp
-from laser_slam.types import Calibration, Frame, Image
+from laser_slam.types import NO_DISTORTION, Calibration, Frame, Image
 from laser_slam.windows import cut_windows, rotation_residual, select_keyframes
 
 HEIGHT, WIDTH = 240, 640
@@ -26,7 +26,7 @@ CONFIG = WindowsConfig()
 
 
 def resized(size: tuple[int, int]) -> Callable[[Image], Image]:
-    return Rectifier(Calibration(None, np.zeros(2), size, ""), size).image
+    return Rectifier(Calibration(None, NO_DISTORTION, size, ""), size).image
 
 
 def texture(seed: int) -> NDArray[np.float32]:

@@ -30,7 +30,7 @@ class Drive:
     noise_px: float = 0.3
     outliers: float = 0.0
     intrinsics: Array = field(default_factory=true_camera)
-    distortion: Array = field(default_factory=lambda: np.zeros(2))
+    distortion: Array = field(default_factory=lambda: np.zeros(4))
     num_points: int = 2500
     seed: int = 0
 

@@ -25,7 +25,7 @@ class Bundle:
         starts: (P + 1,) first observation of each point; observations are sorted by point.
         pixels: (M, 2) measured positions.
         is_fixed: (C,) cameras that stay where they are.
-        intrinsics: (6,) fx, fy, cx, cy, and the radial distortion k1, k2 of OpenCV.
+        intrinsics: (8,) fx, fy, cx, cy, and the distortion k1, k2, p1, p2 of OpenCV.
     """
 
     rotations: Array

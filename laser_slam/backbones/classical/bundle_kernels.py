@@ -3,7 +3,7 @@
 They take plain arrays, so that numba compiles them once and they run without the GIL. Shared
 arguments: rotations (C, 3, 3) and translations (C, 3) cam_from_window, points (P, 3), cameras (M,)
 and pixels (M, 2) of the observations, sorted by point, starts (P + 1,) first observation of each
-point, intrinsics (6,) fx, fy, cx, cy, k1, k2.
+point, intrinsics (8,) fx, fy, cx, cy, k1, k2, p1, p2.
 """
 
 from __future__ import annotations
@@ -19,10 +19,13 @@ SETTLED = 1e-5  # relative fall of the cost at which it stops
 
 @njit(cache=True, nogil=True)
 def distorted(x, y, intrinsics):
-    """Return the pixel of a ray (x, y, 1): radial distortion k1, k2 as OpenCV defines it."""
+    """Return the pixel of a ray (x, y, 1), bent by k1, k2, p1, p2 as OpenCV defines them."""
+    k1, k2, p1, p2 = intrinsics[4], intrinsics[5], intrinsics[6], intrinsics[7]
     r2 = x * x + y * y
-    radial = 1 + r2 * (intrinsics[4] + r2 * intrinsics[5])
-    return intrinsics[0] * radial * x + intrinsics[2], intrinsics[1] * radial * y + intrinsics[3]
+    radial = 1 + r2 * (k1 + r2 * k2)
+    u = radial * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = radial * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return intrinsics[0] * u + intrinsics[2], intrinsics[1] * v + intrinsics[3]
 
 
 @njit(cache=True, nogil=True)
@@ -81,9 +84,11 @@ def linearise(R, t, point, pixel, intrinsics, huber, J_cam, J_point, residual):
     r2 = xn * xn + yn * yn
     radial = 1 + r2 * (intrinsics[4] + r2 * intrinsics[5])
     slope = intrinsics[4] + 2 * r2 * intrinsics[5]  # of the radial factor over r2
+    p1, p2 = intrinsics[6], intrinsics[7]
     fx, fy = w * intrinsics[0] / z, w * intrinsics[1] / z
-    ux, uy = fx * (radial + 2 * slope * xn * xn), fx * 2 * slope * xn * yn
-    vx, vy = fy * 2 * slope * xn * yn, fy * (radial + 2 * slope * yn * yn)
+    mixed = 2 * (slope * xn * yn + p1 * xn + p2 * yn)
+    ux, uy = fx * (radial + 2 * slope * xn * xn + 2 * p1 * yn + 6 * p2 * xn), fx * mixed
+    vx, vy = fy * mixed, fy * (radial + 2 * slope * yn * yn + 6 * p1 * yn + 2 * p2 * xn)
     uz, vz = -(ux * xn + uy * yn), -(vx * xn + vy * yn)
     for i, (gx, gy, gz) in enumerate(((ux, uy, uz), (vx, vy, vz))):
         J_cam[i, 0], J_cam[i, 1] = gz * ry - gy * rz, gx * rz - gz * rx

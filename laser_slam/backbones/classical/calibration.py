@@ -17,33 +17,34 @@ import cv2
 import numpy as np
 
 from laser_slam.backbones.classical.bundle import Bundle
-from laser_slam.backbones.classical.calibration_kernels import shared_equations
-from laser_slam.backbones.classical.reconstruction import Reconstruction, Solver
+from laser_slam.backbones.classical.calibration_kernels import NUM_SHARED, shared_equations
+from laser_slam.backbones.classical.reconstruction import Reconstruction, Solver, flat_intrinsics
 from laser_slam.backbones.classical.tracking import FrameTracks, Tracker
 from laser_slam.backbones.classical.twoview import measure_motion
-from laser_slam.camera import COMMON_FOCAL, guess_intrinsics
+from laser_slam.camera import COMMON_FOCAL, guess_intrinsics, intrinsics_matrix
 from laser_slam.config import ClassicalConfig
 from laser_slam.errors import DegenerateGeometryError
 from laser_slam.sim3 import Array, rotation_log
-from laser_slam.types import Calibration, Window
+from laser_slam.types import NO_DISTORTION, Calibration, Window
 
 ROUNDS = 8
-SIGNIFICANT = 60.0  # chi-squared of 3 numbers, lenient: the windows are few and overlap
-SETTLED = 2e-4  # step of relative focal length, k1 and k2 at which it stops
+SIGNIFICANT = 100.0  # chi-squared of 7 numbers, lenient: the windows are few and overlap
+SETTLED = 2e-4  # step of the unknowns at which it stops
 SLACK = 1e-3  # by which the cost may seem to rise, for no bundle is adjusted to the end
 HUBER_PX = 0.5  # at full width of 1280, as all pixels here
 NOISE_PX = 1.5  # of a track, as if tracks were independent: five times what one measures
-# Standard deviations of what is assumed before: relative focal length, k1, k2.
-KNOWN_PRIOR = (0.02, 0.1, 0.1)
-SCANNED_PRIOR = (0.05, 0.1, 0.1)
-GUESSED_PRIOR = (0.002, 0.1, 0.1)
+# Standard deviations of what is assumed before: relative focal length, principal point x and y in
+# focal lengths, k1, k2, p1, p2. Principal point and p1, p2 do nearly the same: both are kept small.
+KNOWN_PRIOR = (0.02, 0.01, 0.01, 0.1, 0.1, 0.005, 0.005)
+SCANNED_PRIOR = (0.05, 0.02, 0.02, 0.1, 0.1, 0.005, 0.005)
+GUESSED_PRIOR = (0.002, 0.002, 0.002, 0.1, 0.1, 0.001, 0.001)
 FOCALS = np.geomspace(0.42, 1.3, 7).tolist()  # in image widths
 LOST_PX = 1.5  # error that a lost observation counts as
 MIN_CONTRAST = 0.1  # of the cost over the focals; below it, nothing is learnt
 NUM_SCANNED = 3  # windows, those that turn most
 MIN_TURN_DEG = 10.0  # of a window that tells the focal length
 MIN_BUNDLES = 2
-MAX_STATE = 0.5  # of relative focal length, k1, k2; beyond it, the equations have run away
+MAX_STATE = 0.5  # of any unknown; beyond it, the equations have run away
 
 
 @dataclass(frozen=True)
@@ -65,13 +66,13 @@ class _Start:
 
     Attributes:
         intrinsics: (3, 3) in pixels.
-        sigmas: of its relative focal length, and of k1 and k2 around zero.
+        sigmas: (7,) of the unknowns, as listed above, around these intrinsics without distortion.
         source: where it comes from, in words.
         is_given: it stays as it is unless the windows clearly agree on another.
     """
 
     intrinsics: Array
-    sigmas: tuple[float, float, float]
+    sigmas: tuple[float, ...]
     source: str
     is_given: bool = False
 
@@ -199,26 +200,25 @@ def _refine(
     bundles = [solution.bundle for solution in solved if solution is not None]
     if len(bundles) < MIN_BUNDLES:
         source = f"{start.source}, unrefined: too little moves"
-        return Calibration(K, np.zeros(2), size, source)
+        return Calibration(K, NO_DISTORTION, size, source)
     found = _optimise(bundles, np.array(start.sigmas), width / 1280, workers)
     corner = np.abs([[0, 0], [width - 1, height - 1]] - K[:2, 2]).max(axis=0)
-    if found is None or _folds(found[0][1:], corner / K[[0, 1], [0, 1]]):
+    if found is None or _folds(found[0][3:], corner / K[[0, 1], [0, 1]]):
         source = f"{start.source}, unrefined: the clip does not tell"
-        return Calibration(K, np.zeros(2), size, source)
+        return Calibration(K, NO_DISTORTION, size, source)
     state, covariance = found
     significance = float(state @ np.linalg.pinv(covariance) @ state)
     if start.is_given and significance < SIGNIFICANT:
         source = f"{start.source}, confirmed on {len(bundles)} windows"
-        return Calibration(K, np.zeros(2), size, source)
-    refined = K.copy()
-    refined[[0, 1], [0, 1]] *= 1 + state[0]
+        return Calibration(K, NO_DISTORTION, size, source)
+    fx, fy, cx, cy, *distortion = _with(flat_intrinsics(K), state)
     source = f"{start.source}, refined on {len(bundles)} windows"
-    return Calibration(refined, state[1:], size, source)
+    return Calibration(intrinsics_matrix(fx, fy, cx, cy), np.array(distortion), size, source)
 
 
 def _folds(distortion: Array, corner: Array) -> bool:
     """Tell whether the lens would show something twice before the corner, a (2,) ray slope."""
-    k1, k2 = distortion
+    k1, k2 = distortion[:2]
     r2 = np.linspace(0, float(corner @ corner), 50)
     return bool((1 + r2 * (3 * k1 + r2 * 5 * k2)).min() <= 0)
 
@@ -226,20 +226,20 @@ def _folds(distortion: Array, corner: Array) -> bool:
 def _optimise(
     bundles: list[Bundle], prior: Array, unit: float, workers: ThreadPoolExecutor
 ) -> tuple[Array, Array] | None:
-    """Gauss-Newton on relative focal length, k1, k2, everything else adjusted in each round.
+    """Gauss-Newton on the shared unknowns, everything else adjusted in each round.
 
     Args:
         bundles: windows; their poses and points are updated in place.
-        prior: (3,) standard deviations.
+        prior: (7,) standard deviations.
         unit: pixels per pixel of an image 1280 wide.
         workers: threads.
 
     Returns:
-        (3,), and its (3, 3) covariance by how much the windows disagree; None: it does not
+        (7,), and its (7, 7) covariance by how much the windows disagree; None: it does not
         converge.
     """
     given = bundles[0].intrinsics.copy()
-    state = np.zeros(3)
+    state = np.zeros(NUM_SHARED)
     precision = np.diag((NOISE_PX * unit / prior) ** 2)
 
     def equations(bundle: Bundle) -> tuple[Array, Array, float]:
@@ -271,15 +271,16 @@ def _optimise(
 
 
 def _with(given: Array, state: Array) -> Array:
-    focal, k1, k2 = state
+    """Return the (8,) intrinsics that the unknowns make of the given ones."""
     out = given.copy()
-    out[:2] *= 1 + focal
-    out[4:] = k1, k2
+    out[2:4] += given[:2] * state[1:3]
+    out[:2] *= 1 + state[0]
+    out[4:] = state[3:]
     return out
 
 
 def _reduced(bundle: Bundle, huber_px: float) -> tuple[Array, Array]:
-    """Return (3, 3) and (3,) normal equations of the calibration, all else eliminated."""
+    """Return (7, 7) and (7,) normal equations of the calibration, all else eliminated."""
     S, cross, H, s, g = shared_equations(
         bundle.rotations,
         bundle.translations,

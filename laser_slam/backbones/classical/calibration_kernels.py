@@ -13,19 +13,24 @@ from laser_slam.backbones.classical.bundle_kernels import (
     normal_equations,
 )
 
-NUM_SHARED = 3  # relative focal length, k1, k2
+NUM_SHARED = 7  # relative focal length, centre x, y in focal lengths, k1, k2, p1, p2
 
 
 @njit(cache=True, nogil=True)
 def shared_jacobian(x, y, intrinsics, pixel, huber, out):
-    """Fill (2, 3): weighted derivatives of the pixel of ray (x, y, 1) by focal length, k1, k2."""
+    """Fill (2, 7): weighted derivatives of the pixel of ray (x, y, 1) by the shared unknowns."""
     r2 = x * x + y * y
-    radial = 1 + r2 * (intrinsics[4] + r2 * intrinsics[5])
     u, v = distorted(x, y, intrinsics)
     e = np.sqrt((u - pixel[0]) ** 2 + (v - pixel[1]) ** 2)
     weight = 1.0 if e <= huber else np.sqrt(huber / e)
-    for i, part in enumerate((weight * intrinsics[0] * x, weight * intrinsics[1] * y)):
-        out[i, 0], out[i, 1], out[i, 2] = part * radial, part * r2, part * r2 * r2
+    fx, fy = weight * intrinsics[0], weight * intrinsics[1]
+    out[0, 0], out[1, 0] = weight * (u - intrinsics[2]), weight * (v - intrinsics[3])
+    out[0, 1], out[1, 1] = fx, 0.0
+    out[0, 2], out[1, 2] = 0.0, fy
+    out[0, 3], out[1, 3] = fx * x * r2, fy * y * r2
+    out[0, 4], out[1, 4] = fx * x * r2 * r2, fy * y * r2 * r2
+    out[0, 5], out[1, 5] = fx * 2 * x * y, fy * (r2 + 2 * y * y)
+    out[0, 6], out[1, 6] = fx * (r2 + 2 * x * x), fy * 2 * x * y
 
 
 @njit(cache=True, nogil=True)
@@ -33,8 +38,8 @@ def shared_equations(rotations, translations, points, cameras, starts, pixels, i
     """Set up the normal equations of cameras and calibration, the points eliminated.
 
     Returns:
-        (6C, 6C) of the cameras, lower blocks; (6C, 3) between cameras and calibration; (3, 3) of
-        the calibration; (6C,) and (3,) right-hand sides.
+        (6C, 6C) of the cameras, lower blocks; (6C, 7) between cameras and calibration; (7, 7) of
+        the calibration; (6C,) and (7,) right-hand sides.
     """
     num_cams, num = rotations.shape[0], points.shape[0]
     S, s = np.zeros((6 * num_cams, 6 * num_cams)), np.zeros(6 * num_cams)

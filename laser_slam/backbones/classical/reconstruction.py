@@ -84,6 +84,11 @@ def collect(views: list[FrameTracks]) -> Observations:
     return Observations(cameras[keep], starts, pixels[keep], unique[enough])
 
 
+def flat_intrinsics(K: Array) -> Array:
+    """Return (8,) fx, fy, cx, cy and no distortion, as the kernels want them."""
+    return np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.zeros(4)])
+
+
 class Solver:
     """Grow a reconstruction of one window from its tracks."""
 
@@ -91,9 +96,7 @@ class Solver:
         self._views = views
         self._K = intrinsics
         self._unit = views[0].grey.shape[1] / 1280  # thresholds are in pixels at that width
-        self._flat = np.array(
-            [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2], 0.0, 0.0]
-        )
+        self._flat = flat_intrinsics(intrinsics)
         self._all = collect(views)
         num = len(views)
         self.rotations = np.tile(np.eye(3), (num, 1, 1))
