@@ -4,17 +4,35 @@ from __future__ import annotations
 
 import logging
 import time
+import zlib
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from laser_slam.errors import RunFolderError
+from laser_slam.datasets.base import Dataset
+from laser_slam.errors import DatasetError, RunFolderError
 from laser_slam.types import Frame
 
 Item = TypeVar("Item")
 logger = logging.getLogger(__name__)
+
+
+def identify(dataset: Dataset) -> dict[str, Any]:
+    """Tell this input from others: what is known of it, and its first image's checksum."""
+    info = dataset.info
+    first = next(iter(dataset.frames()), None)
+    if first is None:
+        raise DatasetError(f"no frames in {info.name}")
+    image = b"" if first.image is None else first.image.tobytes()
+    return {
+        "name": info.name,
+        "size": list(info.size),
+        "num_frames": info.num_frames,
+        "intrinsics": None if info.intrinsics is None else info.intrinsics.tolist(),
+        "first_image_crc32": zlib.crc32(image),
+    }
 
 
 class FrameLog:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from itertools import islice
@@ -16,11 +15,11 @@ from numpy.typing import NDArray
 
 from laser_slam.backbones import make_backbone
 from laser_slam.backbones.base import Backbone
-from laser_slam.bookkeeping import FrameLog, StageClock, run_log
+from laser_slam.bookkeeping import FrameLog, StageClock, identify, run_log
 from laser_slam.camera import resize_intrinsics
 from laser_slam.config import Config
 from laser_slam.datasets.base import Dataset
-from laser_slam.errors import DatasetError, RunFolderError
+from laser_slam.errors import RunFolderError
 from laser_slam.evaluation.trajectory import evaluate_trajectory
 from laser_slam.export import write_ply
 from laser_slam.fusion import fuse
@@ -138,7 +137,7 @@ class Pipeline:
         return Results(self.folder, trajectory, cloud, report)
 
     def _open_folder(self) -> None:
-        sequence = _identify(self._dataset)
+        sequence = identify(self._dataset)
         is_resumed = open_run_folder(self.folder, self._config, sequence)
         if self._is_named_here:
             link_latest(self.folder)
@@ -163,7 +162,9 @@ class Pipeline:
             keyframes = select_keyframes(frames, config, info.intrinsics, info.size)
             first = islice(keyframes, self._config.calibration.keyframes)
             as_seen = Calibration(None, NO_DISTORTION, self._size, "")
-            yield from cut_windows(first, config, Rectifier(as_seen, self._size).image)
+            for window in cut_windows(first, config, Rectifier(as_seen, self._size).image):
+                yield window
+                self._on_progress("calibrating", int(window.frames[-1]) + 1, None)
 
     def _given(self) -> NDArray[np.float64] | None:
         """Return the intrinsics that came with the data set, in pixels of the backbone's images."""
@@ -277,22 +278,6 @@ class Pipeline:
 
     def _window_file(self, index: int) -> Path:
         return self.folder / "windows" / f"{index:06d}.npz"
-
-
-def _identify(dataset: Dataset) -> dict[str, Any]:
-    """Tell this input from others: what is known of it, and its first image's checksum."""
-    info = dataset.info
-    first = next(iter(dataset.frames()), None)
-    if first is None:
-        raise DatasetError(f"no frames in {info.name}")
-    image = b"" if first.image is None else first.image.tobytes()
-    return {
-        "name": info.name,
-        "size": list(info.size),
-        "num_frames": info.num_frames,
-        "intrinsics": None if info.intrinsics is None else info.intrinsics.tolist(),
-        "first_image_crc32": zlib.crc32(image),
-    }
 
 
 def _resize(images: tuple[Image, ...], size: tuple[int, ...]) -> Image:
