@@ -156,6 +156,22 @@ def test_a_frame_whose_depth_is_another_lowers_the_confidence_of_its_neighbours(
     assert np.median(rate(views, sweeps)) > 0.5
 
 
+def test_frames_from_the_same_place_are_no_witnesses(
+    swept: tuple[list[View], list[Sweep]],
+) -> None:
+    """A camera that stands makes the same error again and again; only where it moved counts."""
+    order = [0, 1, 2, 3, 3, 3, 3, 3, 3, 3, 4, 5, 6]
+    views, sweeps = [swept[0][i] for i in order], [swept[1][i] for i in order]
+    assert np.median(rate(views, sweeps, 6)) > 0.5
+    wrong = [
+        Sweep(np.float32(1.3) * s.inverse_depth, s.uniqueness, s.cost, s.pixels_per_unit, s.is_far)
+        if order[i] == 3
+        else s
+        for i, s in enumerate(sweeps)
+    ]
+    assert np.quantile(rate(views, wrong, 6), 0.95) < 0.05
+
+
 def test_what_no_other_frame_was_asked_about_is_not_trusted(
     swept: tuple[list[View], list[Sweep]],
 ) -> None:
@@ -354,6 +370,12 @@ def test_a_camera_that_stands_takes_its_neighbours_from_when_it_moved() -> None:
     stop_and_go = row_of_cameras(np.array([0, 0.5, 1, 1.001, 1.002, 1.003, 1.5, 2]))
     assert choose_neighbours(stop_and_go, 4, 10.0) == ([1, 0], [6, 7])
     assert choose_neighbours(row_of_cameras(np.zeros(5)), 2, 10.0) == ([], [])
+
+
+def test_a_few_false_points_before_the_lens_do_not_take_the_planes_with_them() -> None:
+    depths = np.random.default_rng(4).uniform(5, 60, 500)
+    false = np.concatenate([depths, np.full(10, 0.01)])
+    assert 1 / plane_range(false, 64)[0] > 0.5 / plane_range(depths, 64)[0]
 
 
 def test_planes_hold_the_sparse_depths_well_inside_at_equal_steps_of_inverse_depth() -> None:

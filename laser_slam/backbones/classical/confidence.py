@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import cv2
 import numpy as np
+from numpy.linalg import norm
 from numpy.typing import NDArray
 
 from laser_slam.backbones.classical.confidence_kernels import ask
@@ -12,7 +15,8 @@ from laser_slam.sim3 import Array
 
 MATCHING_PX = 0.35  # error of a match
 TRUSTED_RELATIVE_ERROR = 0.08  # depth error at which the geometric confidence is one half
-PARTNERS = (-3, -2, -1, 1, 2, 3)  # frames that are asked
+NUM_PARTNERS = 3  # frames that are asked on either side
+MIN_BASELINE = 0.01  # to a partner, in median depths; from the same place, errors are the same too
 UNIQUE_BITS = 48.0  # summed over four paths
 WORST_COST, COST_RANGE = 11.0, 5.0  # bits
 
@@ -41,12 +45,10 @@ def _confidence(views: list[View], sweeps: list[Sweep | None], frame: int, K: Ar
     motion_px = np.maximum(own.pixels_per_unit * own.inverse_depth, 1e-6)
     geometry = 1.0 / (1.0 + (MATCHING_PX / motion_px / TRUSTED_RELATIVE_ERROR) ** 2)
     agree, asked = np.zeros_like(own.cost), np.zeros_like(own.cost)
-    for offset in PARTNERS:
-        if not 0 <= frame + offset < len(views):
-            continue
-        other = sweeps[frame + offset]
+    for partner in _partners(views, frame, own):
+        other = sweeps[partner]
         if other is not None:
-            mapping = relative_pose(views[frame], views[frame + offset])
+            mapping = relative_pose(views[frame], views[partner])
             ask(
                 own.inverse_depth,
                 own.pixels_per_unit,
@@ -62,6 +64,18 @@ def _confidence(views: list[View], sweeps: list[Sweep | None], frame: int, K: Ar
     out = geometry * consistency**1.5 * np.sqrt(unique * match)
     out[_near_sky(own.is_far)] = 0
     return np.asarray(out, np.float32)
+
+
+def _partners(views: list[View], frame: int, own: Sweep) -> list[int]:
+    """Choose the next frames on either side that see a frame's scene from elsewhere."""
+    centre, known = views[frame].centre, own.inverse_depth[~own.is_far]
+    inverse_depth = float(np.median(known)) if len(known) else 0.0
+    sides = (range(frame - 1, -1, -1), range(frame + 1, len(views)))
+    moved = (
+        (j for j in side if norm(views[j].centre - centre) * inverse_depth > MIN_BASELINE)
+        for side in sides
+    )
+    return [j for side in moved for j in islice(side, NUM_PARTNERS)]
 
 
 def _near_sky(is_far: NDArray[np.bool_]) -> NDArray[np.bool_]:

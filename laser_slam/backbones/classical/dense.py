@@ -24,6 +24,7 @@ from laser_slam.config import ClassicalConfig
 from laser_slam.sim3 import Array
 
 NEAR, FAR, FAR_MEDIANS = 0.6, 3.0, 20.0  # range of the planes around the sparse depths
+NEAREST_RATIO = 0.6  # of the first to the fifth percentile; below, the nearest points are false
 KNOWN_CONFIDENCE = 0.02  # below it, depth is unknown
 
 
@@ -104,6 +105,7 @@ def dense_depth(
 
 def plane_range(depths: Array, num: int) -> Float:
     """Return (num,) inverse depths in equal steps, the sparse depths well inside."""
-    near = NEAR * float(np.percentile(depths, 1))
+    nearest, near_ones = np.percentile(depths, (1, 5))
+    near = NEAR * max(float(nearest), NEAREST_RATIO * float(near_ones))
     far = min(FAR * float(np.percentile(depths, 99)), FAR_MEDIANS * float(np.median(depths)))
     return np.linspace(1.0 / near, 1.0 / max(far, 2 * near), num, dtype=np.float32)

@@ -19,7 +19,7 @@ from laser_slam.types import Prediction, WindowStatus
 
 STILL_PX = 1.5  # flow at 640 wide over a window; below, the camera stands
 TURNING_PX = 1.5  # parallax at 640 wide over a window; below, the camera only turns ...
-TURNING_SHARE = 0.05  # ... or parallax per flow: intrinsics are never exact
+TURNING_SHARE = 0.03  # ... or parallax per flow: intrinsics are never exact
 MIN_ANCHORED = 60  # matches; with fewer, flow is measured from a later frame
 MOVED_PX = 4.0  # of a track, at 640 wide; what moves less fits anything
 FEW_FIT = 0.65  # share of the tracks that fit a static scene; less is worth a warning
