@@ -67,7 +67,8 @@ def print_summary(report: dict[str, Any], folder: Path) -> None:
     table = Table(show_header=False, box=None, pad_edge=False)
     for name, value in summarize(report):
         table.add_row(name, Text(value))
-    table.add_row("map", Text(str(folder / "map.ply")))
+    points = f"{report['map']['num_points']:,} points"
+    table.add_row("map", Text(f"{folder / 'map.ply'}, {points}"))
     table.add_row("pictures", Text(str(folder / "pictures")))
     Console(soft_wrap=True).print(table)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from itertools import islice
@@ -61,6 +62,7 @@ from laser_slam.types import (
 from laser_slam.windows import cut_windows, select_keyframes
 
 Progress = Callable[[str, int, int | None], None]
+COMPLETE = "windows/complete"  # the mark that every window of the input has its file
 logger = logging.getLogger(__name__)
 
 
@@ -112,7 +114,8 @@ class Pipeline:
         self._intrinsics: list[NDArray[np.float64]] = []
         self._clock = StageClock()
         self._is_named_here = out is None
-        self.folder = out or new_run_folder(self._info.name)
+        self._is_complete = False
+        self.folder = Path(os.path.normpath(out)) if out else new_run_folder(self._info.name)
 
     def run(self) -> Results:
         """Map the sequence.
@@ -127,6 +130,7 @@ class Pipeline:
             for window in self._windows():
                 prediction, colors = self._predict(window)
                 self._place(prediction, colors)
+            (self.folder / COMPLETE).touch()
             trajectory = self._trajectory()
             cloud = self._fuse()
             with self._clock.stage("evaluate"):
@@ -134,13 +138,14 @@ class Pipeline:
             self._write(trajectory, cloud, scores)
             report = self._report(cloud, scores, warnings)
             write_report(self.folder / "report.json", report)
+        if self._is_named_here:
+            link_latest(self.folder)
         return Results(self.folder, trajectory, cloud, report)
 
     def _open_folder(self) -> None:
         sequence = identify(self._dataset)
         is_resumed = open_run_folder(self.folder, self._config, sequence)
-        if self._is_named_here:
-            link_latest(self.folder)
+        self._is_complete = (self.folder / COMPLETE).exists()
         if is_resumed:
             logger.info("resuming the run in %s", self.folder)
 
@@ -154,6 +159,8 @@ class Pipeline:
             save_calibration(path, self._calibration)
         self._rectifier = Rectifier(self._calibration, self._size)
         logger.info("calibration: %s", self._calibration.source)
+        if self._calibration.warning:
+            logger.warning("calibration: %s", self._calibration.warning)
 
     def _first_windows(self) -> Iterator[Window]:
         """Cut windows from the first keyframes, as the camera sees them."""
@@ -183,7 +190,7 @@ class Pipeline:
     def _predict(self, window: Window) -> tuple[Prediction, Image]:
         """Ask the backbone, or read what it said of this window before the run was broken off."""
         path = self._window_file(window.index)
-        if path.exists() and not self.backbone.remembers:
+        if path.exists() and (self._is_complete or not self.backbone.remembers):
             with self._clock.stage("load"):
                 prediction, colors = load_prediction(path)
             if not np.array_equal(prediction.frames, window.frames):
@@ -227,7 +234,10 @@ class Pipeline:
 
     def _fuse(self) -> Cloud:
         with self._clock.stage("fuse"):
-            return fuse(self._clock.timed("load", self._submaps()), self._config.fusion)
+            cloud = fuse(self._clock.timed("load", self._submaps()), self._config.fusion)
+        if not len(cloud.points):
+            logger.warning("the map is empty: nothing was seen with confidence")
+        return cloud
 
     def _score(self, trajectory: Trajectory) -> Scores:
         """Compare with the truth, as far as there is one."""

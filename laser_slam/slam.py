@@ -86,6 +86,8 @@ class Slam:
         """
         placed = _without_failure(prediction, self._last)
         if self._last is None:
+            if placed.status is not WindowStatus.OK:
+                logger.warning("window 0 has no depth: %s", _STATUS_IN_WORDS[placed.status])
             first_from_window = Sim3.from_matrix(placed.window_from_cam[0]).inverse()
             self._append(placed, first_from_window, None)
         else:

@@ -239,7 +239,7 @@ def _is_broken_off_run(folder: Path) -> bool:
         raise RunFolderError(
             f"{folder} holds a finished run; choose another folder with --out, or remove this one"
         )
-    is_run = "config.yaml" in names
+    is_run = {"config.yaml", "sequence.yaml"} <= names
     if not is_run and names - _OF_AN_EARLY_END:
         raise RunFolderError(
             f"{folder} is neither empty nor a run folder; choose another with --out"

@@ -86,12 +86,14 @@ class Calibration:
         distortion: (4,) radial k1, k2 and tangential p1, p2 as OpenCV defines them.
         size: (height, width) of the images that it is for.
         source: where it comes from, in words.
+        warning: what a person should know of it, one sentence; None: nothing.
     """
 
     intrinsics: NDArray[np.float64] | None
     distortion: NDArray[np.float64]
     size: tuple[int, int]
     source: str
+    warning: str | None = None
 
 
 @dataclass(frozen=True)

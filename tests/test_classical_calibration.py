@@ -173,6 +173,15 @@ def test_what_is_assumed_before_weighs_against_what_is_seen(
     assert found.intrinsics[0, 0] == pytest.approx(FOCAL, rel=1e-4)
 
 
+@pytest.mark.parametrize(("error", "is_doubted"), [(0.01, False), (0.25, True)])
+def test_a_focal_length_far_from_what_the_images_say_is_doubted(
+    error: float, is_doubted: bool
+) -> None:
+    found = measured(TURNING, true_camera(FOCAL * (1 + error)))
+    assert (found.warning is not None) == is_doubted
+    assert not is_doubted or "check what was given" in str(found.warning)
+
+
 def test_no_window_is_said_in_one_line() -> None:
     with pytest.raises(DegenerateGeometryError, match="no window to calibrate the camera by"):
         calibrate([], true_camera(), CONFIG, WORKERS)

@@ -129,16 +129,19 @@ def test_a_run_that_sees_nothing_at_all_still_ends_with_a_pose_for_every_frame(
     assert len(results.cloud.points) == 0
     assert results.report["trajectory"]["reason"] is not None
     assert results.report["trajectory"]["ate_sim3_m"] is None
+    warnings = "; ".join(results.report["warnings"])
+    assert "window 0 has no depth" in warnings
+    assert "the map is empty" in warnings
 
 
 def test_a_broken_off_run_ends_as_one_that_was_not(tmp_path: Path, no_pictures: None) -> None:
     run(tmp_path / "whole", TrueBackbone())
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path / "broken", TrueBackbone(interrupt_at=3))
-    assert len(list((tmp_path / "broken" / "windows").iterdir())) == 3
+    assert len(list((tmp_path / "broken" / "windows").glob("*.npz"))) == 3
     again = TrueBackbone()
     run(tmp_path / "broken", again)
-    whole_windows = len(list((tmp_path / "whole" / "windows").iterdir()))
+    whole_windows = len(list((tmp_path / "whole" / "windows").glob("*.npz")))
     assert again.calls == whole_windows - 3
     assert outcome(tmp_path / "broken") == outcome(tmp_path / "whole")
 
@@ -152,6 +155,19 @@ def test_a_backbone_that_remembers_is_asked_again_for_what_it_must_remember(
         run(tmp_path / "broken", TrueBackbone(remembers=True, interrupt_at=3))
     run(tmp_path / "broken", TrueBackbone(remembers=True))
     assert outcome(tmp_path / "broken") == outcome(tmp_path / "whole")
+
+
+def test_a_run_broken_off_after_its_last_window_predicts_nothing_again(
+    tmp_path: Path, no_pictures: None
+) -> None:
+    run(tmp_path, TrueBackbone(remembers=True))
+    before = outcome(tmp_path)
+    for name in ("report.json", "map.ply", "trajectory_kitti.txt"):
+        (tmp_path / name).unlink()
+    again = TrueBackbone(remembers=True)
+    run(tmp_path, again)
+    assert again.calls == 0
+    assert outcome(tmp_path) == before
 
 
 def test_resuming_with_other_settings_is_refused_by_name(tmp_path: Path) -> None:

@@ -44,6 +44,7 @@ MIN_CONTRAST = 0.1  # of the cost over the focals; below it, nothing is learnt
 NUM_SCANNED = 3  # windows, those that turn most
 MIN_TURN_DEG = 10.0  # of a window that tells the focal length
 MIN_BUNDLES = 2
+DOUBTFUL = 0.04  # change of a given focal length that a person should know of: two sigma
 MAX_STATE = 0.5  # of any unknown; beyond it, the equations have run away
 
 
@@ -158,9 +159,8 @@ def _guess(clips: list[Clip], workers: ThreadPoolExecutor) -> _Start:
     measured = f"(contrast {contrast:.2f})"
     if contrast < MIN_CONTRAST:
         guess = guess_intrinsics(height, width)
-        return _Start(
-            guess, GUESSED_PRIOR, f"guessed: the clip turns too little to tell {measured}"
-        )
+        source = f"guessed: the clip turns too little to tell {measured}"
+        return _Start(guess, GUESSED_PRIOR, source)
     source = f"estimated from the images {measured}"
     if not FOCALS[0] <= focal <= FOCALS[-1]:
         source += ", at the end of what was tried"
@@ -199,21 +199,21 @@ def _refine(
     solved = workers.map(lambda clip: _solve(clip, K, config.refine_radius)[1], clips)
     bundles = [solution.bundle for solution in solved if solution is not None]
     if len(bundles) < MIN_BUNDLES:
-        source = f"{start.source}, unrefined: too little moves"
-        return Calibration(K, NO_DISTORTION, size, source)
+        return Calibration(K, NO_DISTORTION, size, f"{start.source}, unrefined: too little moves")
     found = _optimise(bundles, np.array(start.sigmas), width / 1280, workers)
     corner = np.abs([[0, 0], [width - 1, height - 1]] - K[:2, 2]).max(axis=0)
     if found is None or _folds(found[0][3:], corner / K[[0, 1], [0, 1]]):
-        source = f"{start.source}, unrefined: the clip does not tell"
-        return Calibration(K, NO_DISTORTION, size, source)
+        words = "unrefined: the clip does not tell"
+        return Calibration(K, NO_DISTORTION, size, f"{start.source}, {words}")
     state, covariance = found
-    significance = float(state @ np.linalg.pinv(covariance) @ state)
-    if start.is_given and significance < SIGNIFICANT:
+    if start.is_given and state @ np.linalg.pinv(covariance) @ state < SIGNIFICANT:
         source = f"{start.source}, confirmed on {len(bundles)} windows"
         return Calibration(K, NO_DISTORTION, size, source)
-    fx, fy, cx, cy, *distortion = _with(flat_intrinsics(K), state)
+    fx, fy, cx, cy, *lens = _with(flat_intrinsics(K), state)
     source = f"{start.source}, refined on {len(bundles)} windows"
-    return Calibration(intrinsics_matrix(fx, fy, cx, cy), np.array(distortion), size, source)
+    doubt = f"the images ask for another focal length ({state[0]:+.0%}): check what was given"
+    warning = doubt if start.is_given and abs(state[0]) > DOUBTFUL else None
+    return Calibration(intrinsics_matrix(fx, fy, cx, cy), np.array(lens), size, source, warning)
 
 
 def _folds(distortion: Array, corner: Array) -> bool:

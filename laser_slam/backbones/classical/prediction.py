@@ -79,7 +79,9 @@ def _warnings(views: list[FrameTracks], solution: Reconstruction, num: int) -> t
     did_move = tracks.ids[spread.max(axis=1) > MOVED_PX * unit]
     share = float(np.isin(did_move, solution.ids).mean()) if len(did_move) else 1.0
     if share < FEW_FIT:
-        out.append(f"only {share:.0%} of the tracks fit a static scene")
+        out.append(
+            f"only {share:.0%} of the tracks fit a static scene: things move, or the camera differs"
+        )
     return tuple(out)
 
 
