@@ -236,7 +236,7 @@ def afresh(small_drive: RenderedDrive) -> Prediction:
 
 @pytest.mark.parametrize(
     ("start", "begin"),
-    [(0, 0), (2, 4), (500, 4), (7, 4), (0, 4)],
+    [(0, 0), (2, 4), (500, 4), (8, 4), (0, 4)],
     ids=["again", "other images", "jump", "next without overlap", "another sequence"],
 )
 def test_a_window_that_does_not_go_on_starts_afresh(
@@ -244,7 +244,7 @@ def test_a_window_that_does_not_go_on_starts_afresh(
 ) -> None:
     """Even where its numbers were seen before, for they may be another sequence's."""
     using = backbone()
-    predict(small_drive.images[begin : begin + 7], small_drive.intrinsics, 0, using)
+    predict(small_drive.images[begin : begin + 8], small_drive.intrinsics, 0, using)
     answer = predict(small_drive.images[:8], small_drive.intrinsics, start, using)
     assert answer.frames[0] == start
     assert same(answer, afresh)
@@ -436,16 +436,31 @@ ARRAYS = ("frames", "depth", "confidence", "window_from_cam", "intrinsics")
 def test_of_a_cut_the_larger_part_is_kept(small_drive: RenderedDrive) -> None:
     """The second window begins with four known frames, then shows another place."""
     images, K = small_drive.images, small_drive.intrinsics
-    other = mirrored(images[12:24])
     using = backbone()
-    predict(images[:8], K, 0, using)
-    window = predict(images[4:8] + other, K, 4, using)
+    predict(images[8:24], K, 0, using)
+    window = predict(images[20:24] + mirrored(images[:12]), K, 12, using)
     assert window.status is WindowStatus.OK
     assert window.warnings == ("4 of 16 frames could not be placed",)
     assert window.confidence[4:].any(axis=(1, 2)).all()
-    after = replace_frames(window, 4)
     flip = np.diag([-1.0, 1, 1, 1])
-    assert position_error(after, flip @ small_drive.world_from_cam[12:24] @ flip) < 0.003
+    truth = flip @ small_drive.world_from_cam[:12] @ flip
+    assert position_error(replace_frames(window, 4), truth) < 0.003
+
+
+@pytest.mark.parametrize(
+    ("context", "status"), [(8, WindowStatus.OK), (0, WindowStatus.STATIC)], ids=["with", "without"]
+)
+def test_with_its_context_a_standing_camera_knows_what_it_sees(
+    small_drive: RenderedDrive, context: int, status: WindowStatus
+) -> None:
+    images, K = small_drive.images, small_drive.intrinsics
+    using = backbone(replace_config(context=context))
+    predict(images[:8], K, 0, using)
+    standing = copies(images[7], 8, 1.0)
+    predict(images[4:8] + standing[:4], K, 4, using)
+    window = predict(standing, K, 8, using)
+    assert window.status is status
+    assert window.confidence.any() == (status is WindowStatus.OK)
 
 
 def test_a_drive_goes_on_from_what_it_knows_where_half_the_window_is_dark(

@@ -1,5 +1,6 @@
 """The plane sweep: a known plane comes out, the compiled parts do what slow ones do, no unit."""
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from laser_slam.backbones.classical.confidence import confidences
+from laser_slam.backbones.classical.confidence import choose_partners, confidence
 from laser_slam.backbones.classical.confidence_kernels import ask
 from laser_slam.backbones.classical.dense import PosedFrames, dense_depth, depth_size, plane_range
 from laser_slam.backbones.classical.sweep import Sweep, View, choose_neighbours, make_view, sweep
@@ -22,8 +23,9 @@ from laser_slam.backbones.classical.sweep_kernels import (
     census_transform,
     choose_winners,
     fill_volume,
+    raise_motion,
 )
-from laser_slam.camera import intrinsics_matrix, rays
+from laser_slam.camera import intrinsics_matrix, project, rays
 from laser_slam.config import ClassicalConfig
 from laser_slam.sim3 import Array, rotation_exp
 
@@ -78,8 +80,14 @@ def sweep_all(
     return views, [sweep(views, frame, pairs[frame], planes, K) for frame in range(len(views))]
 
 
-def rate(views: list[View], sweeps: list[Sweep], frame: int = MIDDLE) -> NDArray[np.float32]:
-    return confidences(views, list(sweeps), [frame], K)[0]
+def rate(
+    views: list[View],
+    sweeps: Sequence[Sweep | None],
+    frame: int = MIDDLE,
+    median_depth: float = DISTANCE,
+) -> NDArray[np.float32]:
+    partners = choose_partners(views, frame, median_depth)
+    return confidence(views, list(sweeps), frame, partners, K)
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +131,8 @@ def test_the_unit_of_length_changes_nothing(
         sweeps[MIDDLE].inverse_depth / unit, swept[1][MIDDLE].inverse_depth, rtol=1e-3
     )
     assert same.mean() > 0.995
-    assert np.isclose(rate(views, sweeps), rate(*swept), atol=1e-3).mean() > 0.98
+    scaled = rate(views, sweeps, median_depth=DISTANCE / unit)
+    assert np.isclose(scaled, rate(*swept), atol=1e-3).mean() > 0.98
 
 
 @pytest.mark.parametrize(("step_m", "least", "most"), [(0.5, 0.75, 1.0), (0.02, 0.0, 0.2)])
@@ -156,6 +165,20 @@ def test_a_frame_whose_depth_is_another_lowers_the_confidence_of_its_neighbours(
     assert np.median(rate(views, sweeps)) > 0.5
 
 
+def test_half_of_the_witnesses_are_too_few_for_trust(
+    swept: tuple[list[View], list[Sweep]],
+) -> None:
+    views, sweeps = swept
+    wrong = [
+        Sweep(np.float32(1.3) * s.inverse_depth, s.uniqueness, s.cost, s.pixels_per_unit, s.is_far)
+        if i in (0, 2, 5)
+        else s
+        for i, s in enumerate(sweeps)
+    ]
+    assert 0.1 < np.median(rate(views, wrong)) < 0.4
+    assert np.median(rate(views, sweeps)) > 0.7
+
+
 def test_frames_from_the_same_place_are_no_witnesses(
     swept: tuple[list[View], list[Sweep]],
 ) -> None:
@@ -177,7 +200,7 @@ def test_what_no_other_frame_was_asked_about_is_not_trusted(
 ) -> None:
     views, sweeps = swept
     alone = [s if i == MIDDLE else None for i, s in enumerate(sweeps)]
-    assert not confidences(views, alone, [MIDDLE], K)[0].any()
+    assert not rate(views, alone).any()
 
 
 def test_the_sky_is_not_trusted_nor_its_seam_but_a_speck_takes_nothing_with_it(
@@ -229,6 +252,29 @@ def test_who_sees_a_pixel_from_nearer_must_see_it_nearer() -> None:
         ask(own, motion, np.full_like(own, seen), forward, small_K, agree, asked)
         assert 20 < asked.sum() < own.size
         assert agree.sum() == expected * asked.sum()
+
+
+def test_motion_is_that_in_the_neighbour_where_a_pixel_moves_most(
+    wall: Wall, swept: tuple[list[View], list[Sweep]]
+) -> None:
+    """Move each pixel a little in inverse depth, and see how far it goes in each neighbour."""
+    views, sweeps = swept
+    inverse_depth, small = 1 / wall.depths[0], 1e-5
+    moved = []
+    for other in choose_neighbours(views, 0, 10.0)[1]:
+        rotation = views[other].rotation @ views[0].rotation.T
+        shift = views[other].translation - rotation @ views[0].translation
+        at = [
+            project(rays(K, HEIGHT, WIDTH) @ rotation.T + shift * w[..., None], K)
+            for w in (inverse_depth - small, inverse_depth + small)
+        ]
+        moved.append(np.linalg.norm(at[1] - at[0], axis=-1) / (2 * small))
+    assert np.median(moved[1] / moved[0]) > 1.8
+    best = np.maximum(*moved)[8:-8, 12:-12]
+    assert np.median(np.abs(sweeps[0].pixels_per_unit[8:-8, 12:-12] / best - 1)) < 0.01
+    out = np.full((HEIGHT, WIDTH), 1e9, np.float32)
+    raise_motion(np.column_stack([K, K @ shift]), sweeps[0].inverse_depth, out)
+    assert (out == np.float32(1e9)).all()  # raised, never lowered
 
 
 def test_census_has_a_bit_for_each_darker_neighbour() -> None:

@@ -67,7 +67,6 @@ class ClassicalBackbone:
         views = self._track(images, frames)
         window = views[-len(frames) :]
         solved = self._solve(views, window, K)
-        self._poses = {}
         if solved is not None:
             used, solution = solved
             prediction = with_depth(used, solution, frames, K, self._config, self._workers)
@@ -91,26 +90,28 @@ class ClassicalBackbone:
     def _solve(
         self, views: list[FrameTracks], window: list[FrameTracks], K: Array
     ) -> tuple[list[FrameTracks], Reconstruction] | None:
-        """Go on from the known poses, which keeps the scale; where that places few, start afresh.
+        """Go on from the known poses, which keeps the scale; if that fails at most frames, afresh.
 
         Returns:
-            The frames that are reconstructed, of which the last are the window, and how.
+            The frames that were used, context and window or some of the window, and what they gave.
         """
         known: Poses = {
             i: self._poses[v.frame] for i, v in enumerate(views) if v.frame in self._poses
         }
-        attempts: list[tuple[list[FrameTracks], Poses]] = [(views, known)]
-        if known or len(views) > len(window):
-            attempts.append((window, {}))
-        best, most = None, MIN_PLACED
-        for used, start in attempts:
-            solution = _reconstruct(used, start, K, self._config.refine_radius)
-            share = 0.0 if solution is None else float(solution.has_pose[-len(window) :].mean())
-            if solution is not None and share > most:
-                best, most = (used, solution), share
-            if most >= ENOUGH_PLACED:
-                break
-        return best
+        radius = self._config.refine_radius
+        placed, solution = _reconstruct(views, known, K, radius)
+        is_placed = placed[-len(window) :]
+        if solution is not None and is_placed.mean() >= ENOUGH_PLACED:
+            return views, solution
+        rest = [view for view, done in zip(window, is_placed, strict=True) if not done]
+        num, used = int(is_placed.sum()), views
+        if known or len(rest) < len(views):
+            others, afresh = _reconstruct(rest, {}, K, radius)
+            if others.sum() > num:
+                num, used, solution = int(others.sum()), rest, afresh
+        if solution is None or num < MIN_PLACED * len(window):
+            return None
+        return used, solution
 
 
 def _num_continued(
@@ -130,11 +131,12 @@ def _num_continued(
 
 def _reconstruct(
     views: list[FrameTracks], known: Poses, K: Array, radius: int
-) -> Reconstruction | None:
-    solver = Solver(views, K)
+) -> tuple[NDArray[np.bool_], Reconstruction | None]:
+    """Return which of the views could be placed, and the reconstruction if any could."""
+    solver, solution = Solver(views, K), None
     if len(known) >= MIN_KNOWN:
         solver.start_from_known(known)
-    elif not solver.start_from_pair():
-        return None
-    solver.grow()
-    return solver.finish(radius)
+    if solver.has_pose.any() or solver.start_from_pair():
+        solver.grow()
+        solution = solver.finish(radius)
+    return (np.zeros(len(views), bool) if solution is None else solution.has_pose), solution

@@ -21,31 +21,28 @@ UNIQUE_BITS = 48.0  # summed over four paths
 WORST_COST, COST_RANGE = 11.0, 5.0  # bits
 
 
-def confidences(
-    views: list[View], sweeps: list[Sweep | None], wanted: list[int], K: Array
-) -> list[Float]:
-    """Rate the depths of the wanted frames against those of the frames around them.
+def confidence(
+    views: list[View], sweeps: list[Sweep | None], frame: int, partners: list[int], K: Array
+) -> Float:
+    """Rate the depths of one frame against those of the frames around it.
 
     Args:
         views: frames in order.
         sweeps: one each; None: this frame was not swept.
-        wanted: which frames to rate; each was swept.
+        frame: which one to rate; it was swept.
+        partners: the frames that are asked, as far as they were swept.
         K: (3, 3) intrinsics of the depth maps.
 
     Returns:
-        (H, W) in [0, 1] each; calibrated so that about 90 % of the pixels above 0.5 err by less
+        (H, W) in [0, 1]; calibrated so that about 90 % of the pixels above 0.5 err by less
         than a tenth of their depth.
     """
-    return [_confidence(views, sweeps, frame, K) for frame in wanted]
-
-
-def _confidence(views: list[View], sweeps: list[Sweep | None], frame: int, K: Array) -> Float:
     own = sweeps[frame]
     assert own is not None
     motion_px = np.maximum(own.pixels_per_unit * own.inverse_depth, 1e-6)
     geometry = 1.0 / (1.0 + (MATCHING_PX / motion_px / TRUSTED_RELATIVE_ERROR) ** 2)
     agree, asked = np.zeros_like(own.cost), np.zeros_like(own.cost)
-    for partner in _partners(views, frame, own):
+    for partner in partners:
         other = sweeps[partner]
         if other is not None:
             mapping = relative_pose(views[frame], views[partner])
@@ -66,13 +63,12 @@ def _confidence(views: list[View], sweeps: list[Sweep | None], frame: int, K: Ar
     return np.asarray(out, np.float32)
 
 
-def _partners(views: list[View], frame: int, own: Sweep) -> list[int]:
+def choose_partners(views: list[View], frame: int, median_depth: float) -> list[int]:
     """Choose the next frames on either side that see a frame's scene from elsewhere."""
-    centre, known = views[frame].centre, own.inverse_depth[~own.is_far]
-    inverse_depth = float(np.median(known)) if len(known) else 0.0
+    centre = views[frame].centre
     sides = (range(frame - 1, -1, -1), range(frame + 1, len(views)))
     moved = (
-        (j for j in side if norm(views[j].centre - centre) * inverse_depth > MIN_BASELINE)
+        (j for j in side if norm(views[j].centre - centre) > MIN_BASELINE * median_depth)
         for side in sides
     )
     return [j for side in moved for j in islice(side, NUM_PARTNERS)]

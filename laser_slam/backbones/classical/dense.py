@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.backbones.classical.confidence import confidences
+from laser_slam.backbones.classical.confidence import choose_partners, confidence
 from laser_slam.backbones.classical.sweep import (
     Float,
     Sweep,
@@ -25,6 +25,8 @@ from laser_slam.sim3 import Array
 
 NEAR, FAR, FAR_MEDIANS = 0.6, 3.0, 20.0  # range of the planes around the sparse depths
 NEAREST_RATIO = 0.6  # of the first to the fifth percentile; below, the nearest points are false
+MIN_SPARSE = 10  # points that tell a frame's range of depths
+MIN_WITNESSES = 2  # frames that a frame's depth is compared with
 KNOWN_CONFIDENCE = 0.02  # below it, depth is unknown
 
 
@@ -72,35 +74,59 @@ def dense_depth(
     size = depth_size((full[0], full[1]), config.depth_width)
     K = resize_intrinsics(frames.intrinsics, (full[0], full[1]), size)
 
+    views = _make_views(frames, size, workers)
+    medians = [float(np.median(d)) if len(d) >= MIN_SPARSE else 0.0 for d in frames.sparse_depths]
+    partners = {i: choose_partners(views, i, medians[i]) for i in wanted if medians[i] > 0}
+    sweeps: list[Sweep | None] = [None] * len(views)
+
+    def find(frame: int) -> None:
+        if medians[frame] > 0:
+            known = frames.sparse_depths[frame]
+            sweeps[frame] = _sweep_between(views, frame, known, config.num_planes, K)
+
+    depth = np.full((len(wanted), *size), np.nan, np.float32)
+    rating = np.zeros((len(wanted), *size), np.float32)
+
+    def rate(frame: int) -> None:
+        result, slot = sweeps[frame], wanted.index(frame)
+        if result is not None:
+            trust = confidence(views, sweeps, frame, partners[frame], K)
+            is_known = (trust > KNOWN_CONFIDENCE) & (result.inverse_depth > 0)
+            depth[slot][is_known] = 1.0 / result.inverse_depth[is_known]
+            rating[slot][is_known] = trust[is_known]
+
+    list(workers.map(find, _with_witnesses(partners)))
+    list(workers.map(rate, partners))
+    return depth, rating, K
+
+
+def _make_views(
+    frames: PosedFrames, size: tuple[int, int], workers: ThreadPoolExecutor
+) -> list[View]:
     def view(frame: int) -> View:
         grey = cv2.resize(frames.greys[frame], size[::-1], interpolation=cv2.INTER_AREA)
         return make_view(grey, frames.rotations[frame], frames.translations[frame])
 
-    views = list(workers.map(view, range(len(frames.greys))))
+    return list(workers.map(view, range(len(frames.greys))))
 
-    def depths(frame: int) -> Sweep | None:
-        known = frames.sparse_depths[frame]
-        if len(known) < 10:
-            return None
-        neighbours = choose_neighbours(views, frame, float(np.median(known)))
-        if not neighbours[0] and not neighbours[1]:
-            return None
-        return sweep(views, frame, neighbours, plane_range(known, config.num_planes), K)
 
-    sweeps: list[Sweep | None] = [None] * len(views)
-    for frame, result in zip(wanted, workers.map(depths, wanted), strict=True):
-        sweeps[frame] = result
-    depth = np.full((len(wanted), *size), np.nan, np.float32)
-    confidence = np.zeros((len(wanted), *size), np.float32)
-    swept = [frame for frame in wanted if sweeps[frame] is not None]
-    rated = workers.map(lambda frame: confidences(views, sweeps, [frame], K)[0], swept)
-    for frame, rating in zip(swept, rated, strict=True):
-        slot, result = wanted.index(frame), sweeps[frame]
-        if result is not None:
-            is_known = (rating > KNOWN_CONFIDENCE) & (result.inverse_depth > 0)
-            depth[slot][is_known] = 1.0 / result.inverse_depth[is_known]
-            confidence[slot][is_known] = rating[is_known]
-    return depth, confidence, K
+def _sweep_between(
+    views: list[View], frame: int, sparse_depths: Array, num_planes: int, K: Array
+) -> Sweep | None:
+    """Sweep a frame over the range of its sparse depths; None: no view is far enough from it."""
+    neighbours = choose_neighbours(views, frame, float(np.median(sparse_depths)))
+    if not neighbours[0] and not neighbours[1]:
+        return None
+    return sweep(views, frame, neighbours, plane_range(sparse_depths, num_planes), K)
+
+
+def _with_witnesses(partners: dict[int, list[int]]) -> list[int]:
+    """Return the frames to sweep: those to rate, and partners of those that have too few there."""
+    out = set(partners)
+    for asked in partners.values():
+        if sum(frame in partners for frame in asked) < MIN_WITNESSES:
+            out.update(asked)
+    return sorted(out)
 
 
 def plane_range(depths: Array, num: int) -> Float:
