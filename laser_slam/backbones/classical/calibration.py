@@ -27,24 +27,23 @@ from laser_slam.errors import DegenerateGeometryError
 from laser_slam.sim3 import Array, rotation_log
 from laser_slam.types import NO_DISTORTION, Calibration, Window
 
-ROUNDS = 8
-SIGNIFICANT = 100.0  # chi-squared of 7 numbers, lenient: the windows are few and overlap
-SETTLED = 2e-4  # step of the unknowns at which it stops
+SIGNIFICANT = 60.0  # chi-squared of 3 numbers, lenient: the windows are few and overlap
+ROUNDS, SETTLED = 8, 2e-4  # at most, and the step of the unknowns at which it stops
 SLACK = 1e-3  # by which the cost may seem to rise, for no bundle is adjusted to the end
 HUBER_PX = 0.5  # at full width of 1280, as all pixels here
 NOISE_PX = 1.5  # of a track, as if tracks were independent: five times what one measures
-# Standard deviations of what is assumed before: relative focal length, principal point x and y in
-# focal lengths, k1, k2, p1, p2. Principal point and p1, p2 do nearly the same: both are kept small.
-KNOWN_PRIOR = (0.02, 0.01, 0.01, 0.1, 0.1, 0.005, 0.005)
+# Standard deviations before: relative focal length, principal point in focal lengths, k1, k2, p1,
+# p2. A given principal point stays: it defines the axes that given poses are in.
+KNOWN_PRIOR = (0.02, 1e-4, 1e-4, 0.1, 0.1, 1e-4, 1e-4)
 SCANNED_PRIOR = (0.05, 0.02, 0.02, 0.1, 0.1, 0.005, 0.005)
 GUESSED_PRIOR = (0.002, 0.002, 0.002, 0.1, 0.1, 0.001, 0.001)
 FOCALS = np.geomspace(0.42, 1.3, 7).tolist()  # in image widths
 LOST_PX = 1.5  # error that a lost observation counts as
 MIN_CONTRAST = 0.1  # of the cost over the focals; below it, nothing is learnt
-NUM_SCANNED = 3  # windows, those that turn most
-MIN_TURN_DEG = 10.0  # of a window that tells the focal length
+NUM_SCANNED, MIN_TURN_DEG = 3, 10.0  # windows that turn most, and how far they must
 MIN_BUNDLES = 2
-DOUBTFUL = 0.04  # change of a given focal length that a person should know of: two sigma
+UNTOLD = "the clip does not tell"
+DOUBTFUL = 0.04  # change of a given focal length that a person should know of
 MAX_STATE = 0.5  # of any unknown; beyond it, the equations have run away
 
 
@@ -198,22 +197,23 @@ def _refine(
     K, size = start.intrinsics, (height, width)
     solved = workers.map(lambda clip: _solve(clip, K, config.refine_radius)[1], clips)
     bundles = [solution.bundle for solution in solved if solution is not None]
+    on = f"on {len(bundles)} windows"
     if len(bundles) < MIN_BUNDLES:
         return Calibration(K, NO_DISTORTION, size, f"{start.source}, unrefined: too little moves")
     found = _optimise(bundles, np.array(start.sigmas), width / 1280, workers)
     corner = np.abs([[0, 0], [width - 1, height - 1]] - K[:2, 2]).max(axis=0)
     if found is None or _folds(found[0][3:], corner / K[[0, 1], [0, 1]]):
-        words = "unrefined: the clip does not tell"
-        return Calibration(K, NO_DISTORTION, size, f"{start.source}, {words}")
+        return Calibration(K, NO_DISTORTION, size, f"{start.source}, unrefined: {UNTOLD}")
     state, covariance = found
-    if start.is_given and state @ np.linalg.pinv(covariance) @ state < SIGNIFICANT:
-        source = f"{start.source}, confirmed on {len(bundles)} windows"
-        return Calibration(K, NO_DISTORTION, size, source)
+    free = np.ix_(np.array(start.sigmas) > 1e-3)[0]  # the others say nothing
+    chi2 = state[free] @ np.linalg.pinv(covariance[np.ix_(free, free)]) @ state[free]
+    if start.is_given and chi2 < SIGNIFICANT:
+        return Calibration(K, NO_DISTORTION, size, f"{start.source}, confirmed {on}")
     fx, fy, cx, cy, *lens = _with(flat_intrinsics(K), state)
-    source = f"{start.source}, refined on {len(bundles)} windows"
+    words = f"{start.source}, refined {on}"
     doubt = f"the images ask for another focal length ({state[0]:+.0%}): check what was given"
-    warning = doubt if start.is_given and abs(state[0]) > DOUBTFUL else None
-    return Calibration(intrinsics_matrix(fx, fy, cx, cy), np.array(lens), size, source, warning)
+    told = doubt if start.is_given and abs(state[0]) > DOUBTFUL else None
+    return Calibration(intrinsics_matrix(fx, fy, cx, cy), np.array(lens), size, words, told)
 
 
 def _folds(distortion: Array, corner: Array) -> bool:
@@ -266,7 +266,7 @@ def _optimise(
             if costs[-1] > costs[0] * (1 + SLACK):
                 return None
             pulls = np.linalg.solve(H, np.stack([term[1] for term in terms]).T)
-            return state, pulls @ pulls.T
+            return state, np.cov(pulls) * len(terms)
     return None
 
 
