@@ -151,9 +151,10 @@ def choose_winners(total, volume, planes):
             costs = total[i, j]
             best = np.argmin(costs)
             second = np.float32(1e9)
-            for d in range(num):
-                if abs(d - best) > 2 and costs[d] < second:
-                    second = costs[d]
+            for d in range(best - 2):
+                second = min(second, costs[d])
+            for d in range(best + 3, num):
+                second = min(second, costs[d])
             offset = 0.0
             if 0 < best < num - 1:
                 left, right = costs[best - 1] - costs[best], costs[best + 1] - costs[best]
