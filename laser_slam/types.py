@@ -187,12 +187,54 @@ class Registration:
 
 
 @dataclass(frozen=True)
+class Layers:
+    """The depth layers of one window, and what layer-wise scale alignment makes of them.
+
+    Kept beside the depth as it was predicted, and applied on use: a node that moves in the pose
+    graph takes its layers along, for their scales are relative to its own.
+
+    Attributes:
+        labels: (N, h, w) layer of each pixel, from 1 in each frame; 0: depth unknown. A cell
+            stands for a block of f x f pixels, where h = ceil(H / f) and w = ceil(W / f).
+        starts: (N + 1,) where the layers of each frame begin in ``scales``: layer ``k`` of frame
+            ``i`` is row ``starts[i] + k - 1``.
+        scales: (M,) factor on the depth of each layer; 1: as predicted.
+        witnesses: (M,) how many windows agreed on the scale, this one included; a layer that no
+            earlier window has seen has 1.
+        curve: (K, 2) depths in window units, rising, and the factor there, on top of ``scales``;
+            between them the logarithms are interpolated, outside the ends hold. Empty: none.
+
+    Raises:
+        ValueError: shapes disagree, or a scale is not positive and finite.
+    """
+
+    labels: NDArray[np.uint16]
+    starts: NDArray[np.int64]
+    scales: NDArray[np.float64]
+    witnesses: NDArray[np.float64]
+    curve: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        """Check shapes and values once, here."""
+        num = len(self.scales)
+        if self.labels.ndim != 3 or len(self.starts) != len(self.labels) + 1:
+            raise ValueError(f"labels {self.labels.shape}, starts {self.starts.shape}")
+        if self.starts[0] != 0 or self.starts[-1] != num or self.witnesses.shape != (num,):
+            raise ValueError(f"{num} scales, starts {self.starts[[0, -1]]}")
+        if self.curve.ndim != 2 or self.curve.shape[1] != 2:
+            raise ValueError(f"a curve must be (K, 2), got {self.curve.shape}")
+        for factors in (self.scales, self.curve):
+            if not ((factors > 0) & (factors < np.inf)).all():
+                raise ValueError("layer scales must be positive and finite")
+
+
+@dataclass(frozen=True)
 class Submap:
     """A prediction with its place in the world.
 
     Attributes:
         index: of its window.
-        prediction: the backbone's view, never altered.
+        prediction: the backbone's view; where layers were aligned, with their scales applied.
         colors: (N, H, W, 3) RGB uint8, at the size of the depth maps.
         world_from_window: its Sim(3) node.
         is_owned: (N,) True where this window gives the frame to trajectory and map.

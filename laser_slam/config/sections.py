@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-
-from laser_slam.errors import ConfigError
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class _Section(BaseModel):
@@ -99,6 +93,23 @@ class RegistrationConfig(_Section):
     min_pixels: int = Field(100, ge=10, description="confident pixels that the scale needs")
 
 
+class SegmentationConfig(_Section):
+    """Depth maps to layers."""
+
+    segmenter: str = Field(
+        "felzenszwalb", description="one of the names in laser_slam.layers.SEGMENTERS"
+    )
+    downscale: int = Field(
+        2, ge=1, le=8, description="layers are found on every so many-th row and column"
+    )
+
+
+class LayersConfig(_Section):
+    """Layer-wise scale alignment."""
+
+    segmentation: SegmentationConfig = SegmentationConfig()
+
+
 class FusionConfig(_Section):
     """Submaps to one coloured cloud."""
 
@@ -150,124 +161,7 @@ class Config(_Section):
     calibration: CalibrationConfig = CalibrationConfig()
     backbone: BackboneConfig = BackboneConfig()
     registration: RegistrationConfig = RegistrationConfig()
+    layers: LayersConfig = LayersConfig()
     fusion: FusionConfig = FusionConfig()
     synthetic: SyntheticConfig = SyntheticConfig()
     run: RunConfig = RunConfig()
-
-
-def load_config(
-    name: str | None = None, file: Path | None = None, assignments: Sequence[str] = ()
-) -> Config:
-    """Layer the settings: code < ``configs/<name>.yaml`` < ``file`` < ``key=value`` assignments.
-
-    Args:
-        name: of a settings file that ships with laser-slam, such as ``kitti``.
-        file: a settings file of the user's.
-        assignments: ``section.key=value``, the value in YAML.
-
-    Raises:
-        ConfigError: a file is missing or no YAML, a setting is unknown or out of its limits.
-
-    >>> load_config(assignments=["windows.size=30"]).windows.size
-    30
-    """
-    settings: dict[str, Any] = {}
-    if name is not None:
-        _merge(settings, _read_shipped(name))
-    if file is not None:
-        _merge(settings, _read_yaml(file))
-    for assignment in assignments:
-        _merge(settings, _parse_assignment(assignment))
-    return _validate(settings)
-
-
-def shipped_configs() -> Path:
-    """Return the folder of the settings files that ship with laser-slam."""
-    installed = Path(__file__).parent / "configs"
-    return installed if installed.is_dir() else Path(__file__).parents[1] / "configs"
-
-
-def dump_config(config: Config) -> str:
-    """Write all settings as YAML, defaults included."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
-
-
-def setting_names(model: type[BaseModel] = Config, prefix: str = "") -> Iterator[str]:
-    """List every setting as ``section.key``."""
-    for key, field in model.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            yield from setting_names(field.annotation, f"{prefix}{key}.")
-        else:
-            yield prefix + key
-
-
-def _validate(settings: dict[str, Any]) -> Config:
-    try:
-        return Config.model_validate(settings)
-    except ValidationError as error:
-        raise ConfigError("; ".join(_explain(dict(item)) for item in error.errors())) from error
-
-
-def _explain(item: dict[str, Any]) -> str:
-    name = ".".join(str(part) for part in item["loc"])
-    given = item["input"]
-    if item["type"] == "extra_forbidden":
-        return _explain_unknown(name, given)
-    if item["type"] == "model_type":
-        return f"{name}: a section needs settings below it, got {given!r}"[:300]
-    text = str(item["msg"]).removeprefix("Value error, ")
-    # A validator of ours has said what it got.
-    got = "" if item["type"] == "value_error" else f", got {given!r}"
-    return f"{name}: {text[0].lower()}{text[1:]}{got}"[:300]
-
-
-def _explain_unknown(name: str, given: Any) -> str:
-    while isinstance(given, dict) and len(given) > 0:
-        key, given = next(iter(given.items()))
-        name += f".{key}"
-    known = list(setting_names())
-    same_end = [other for other in known if other.endswith("." + name.rpartition(".")[2])]
-    near = difflib.get_close_matches(name, known, n=1) or same_end
-    return f"{name}: no such setting" + (f" (did you mean {near[0]}?)" if near else "")
-
-
-def _read_shipped(name: str) -> dict[str, Any]:
-    names = sorted(path.stem for path in shipped_configs().glob("*.yaml"))
-    if name not in names:
-        raise ConfigError(f"no settings named '{name}'; there are: {', '.join(names)}")
-    return _read_yaml(shipped_configs() / f"{name}.yaml")
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"cannot read settings file {path}: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not a YAML file: {' '.join(str(error).split())}") from error
-    if content is None:
-        return {}
-    if not isinstance(content, dict):
-        raise ConfigError(f"{path} must hold sections such as 'windows:', got {content!r:.60}")
-    return content
-
-
-def _parse_assignment(assignment: str) -> dict[str, Any]:
-    name, equals, value = assignment.partition("=")
-    if not equals or not all(name.strip().split(".")):
-        raise ConfigError(f"--set wants section.key=value, got '{assignment}'")
-    try:
-        settings: Any = yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{name}: '{value}' is no YAML value") from error
-    for key in reversed(name.strip().split(".")):
-        settings = {key: settings}
-    return dict(settings)
-
-
-def _merge(base: dict[str, Any], over: dict[str, Any]) -> None:
-    for key, value in over.items():
-        if isinstance(value, dict) and isinstance(base.get(key), dict):
-            _merge(base[key], value)
-        else:
-            base[key] = value

@@ -1,0 +1,36 @@
+"""Every setting, and how settings are read."""
+
+from laser_slam.config.loading import dump_config, load_config, setting_names, shipped_configs
+from laser_slam.config.sections import (
+    BackboneConfig,
+    CalibrationConfig,
+    ClassicalConfig,
+    Config,
+    DatasetConfig,
+    FusionConfig,
+    LayersConfig,
+    RegistrationConfig,
+    RunConfig,
+    SegmentationConfig,
+    SyntheticConfig,
+    WindowsConfig,
+)
+
+__all__ = [
+    "BackboneConfig",
+    "CalibrationConfig",
+    "ClassicalConfig",
+    "Config",
+    "DatasetConfig",
+    "FusionConfig",
+    "LayersConfig",
+    "RegistrationConfig",
+    "RunConfig",
+    "SegmentationConfig",
+    "SyntheticConfig",
+    "WindowsConfig",
+    "dump_config",
+    "load_config",
+    "setting_names",
+    "shipped_configs",
+]
