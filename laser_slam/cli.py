@@ -73,8 +73,10 @@ class RunOptions:
         return _resolve(self.config, assignments)
 
 
-def command(function: Callable[..., None]) -> Callable[..., None]:
+def command(function: Callable[..., None], name: str | None = None) -> Callable[..., None]:
     """Make a function a command: its ``options`` become flags, its errors one line.
+
+    The command has the function's name, unless one is given that no function can have.
 
     Known errors exit with 1, Ctrl-C with 130; everything else is a bug and keeps its traceback.
     """
@@ -100,7 +102,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
 
     run.__signature__ = inspect.Signature(own + shared)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in own + shared}
-    app.command()(run)
+    app.command(name)(run)
     return run
 
 
@@ -168,6 +170,17 @@ def kitti(
             "'sequences'"
         )
     _map(KittiOdometry(root, sequence), options.settings(), options)
+
+
+@functools.partial(command, name="7scenes")
+def seven_scenes(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Such as kitchen/seq-01.")],
+    options: RunOptions,
+) -> None:
+    """Map a sequence of 7-Scenes; score it against its poses and depth."""
+    from laser_slam.datasets.seven_scenes import SevenScenes
+
+    _map(SevenScenes(folder), options.settings(), options)
 
 
 @command
