@@ -166,7 +166,7 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_file(
         if len(synced) > 4:  # sequence, settings, calibration, one window
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("laser_slam.store.os.fsync", fill_up)
+    monkeypatch.setattr("laser_slam.store.files.os.fsync", fill_up)
     result = run("images", photos, *FOV, "--backbone", "true", *SMALL, "--out", tmp_path / "run",
                  "--quiet")  # fmt: skip
     assert "No space left on device; free some space" in the_line(result)

@@ -160,7 +160,7 @@ def test_a_full_disk_is_one_line_that_says_what_to_do(
     def no_space(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("laser_slam.store.os.fsync", no_space)
+    monkeypatch.setattr("laser_slam.store.files.os.fsync", no_space)
     with pytest.raises(RunFolderError, match=r"No space left on device; free some space"):
         save_prediction(tmp_path / "0.npz", a_prediction(), a_street())
     assert not list(tmp_path.iterdir())

@@ -107,7 +107,40 @@ class SegmentationConfig(_Section):
 class LayersConfig(_Section):
     """Layer-wise scale alignment."""
 
+    enabled: Literal["auto", "always", "never"] = Field(
+        "auto", description="auto: for backbones whose depth it improves"
+    )
     segmentation: SegmentationConfig = SegmentationConfig()
+    tau_inter: float = Field(
+        0.3, ge=0, lt=1, description="IoU above which layers of two windows are linked"
+    )
+    tau_intra: float = Field(
+        0.3, ge=0, lt=1, description="IoU above which layers of consecutive frames are linked"
+    )
+    intra: bool = Field(True, description="scales go on from frame to frame; false: 'w/o intra'")
+    scale: Literal["median", "huber", "l1", "closed_form"] = Field(
+        "median", description="estimator of a layer's scale; huber: the paper's, in metric depth"
+    )
+    confidence: bool = Field(True, description="pixels weigh by their confidence; false: all alike")
+    shrink: bool = Field(
+        True,
+        description="what noise explains is no scale, and what depth explains is a curve over it; "
+        "false: each layer's scale as measured",
+    )
+    curve: bool = Field(True, description="with shrink: scales may follow a curve over log depth")
+    memory: int = Field(
+        20, ge=0, description="windows whose opinions a scale averages; 0: the one before is right"
+    )
+    min_support: float = Field(
+        3e-4, ge=0, le=1, description="share of the image that a measured scale needs"
+    )
+    max_spread: float = Field(
+        0.15, gt=0, description="standard deviation of log-ratios in a layer; more: no one scale"
+    )
+    max_scale: float = Field(1.6, gt=1, description="scales beyond it, or its inverse, are refused")
+    feather: float = Field(
+        16, ge=0, description="px over which scales blend where a surface goes on; 0: not at all"
+    )
 
 
 class FusionConfig(_Section):

@@ -1,1 +1,9 @@
-"""Layer-wise scale alignment: depth in layers, each with a scale of its own."""
+"""Layer-wise scale alignment: depth in layers, each with a scale of its own.
+
+Reference: LASER (arXiv:2512.13680), section 3.2.
+"""
+
+from laser_slam.layers.alignment import LayerCounts, align_layers, first_layers
+from laser_slam.layers.correction import apply_layers
+
+__all__ = ["LayerCounts", "align_layers", "apply_layers", "first_layers"]

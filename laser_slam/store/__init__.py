@@ -1,0 +1,24 @@
+"""Files of the run folder."""
+
+from laser_slam.store.files import atomic_write, write_text
+from laser_slam.store.run import link_latest, new_run_folder, open_run_folder
+from laser_slam.store.windows import (
+    FORMAT_VERSION,
+    load_layers,
+    load_prediction,
+    save_layers,
+    save_prediction,
+)
+
+__all__ = [
+    "FORMAT_VERSION",
+    "atomic_write",
+    "link_latest",
+    "load_layers",
+    "load_prediction",
+    "new_run_folder",
+    "open_run_folder",
+    "save_layers",
+    "save_prediction",
+    "write_text",
+]

@@ -1,0 +1,163 @@
+"""What a backbone said of each window, and what became of its layers: one file each."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image
+from numpy.typing import NDArray
+
+from laser_slam.errors import RunFolderError
+from laser_slam.store.files import atomic_write
+from laser_slam.types import Image, Layers, Prediction, WindowStatus
+
+FORMAT_VERSION = 1
+JPEG_QUALITY = 85
+
+
+def save_prediction(path: Path, prediction: Prediction, colors: Image) -> Prediction:
+    """Write one window without pickle: the cache, the resume point and the replay's input.
+
+    Depth is kept to a relative 5e-4, confidence in steps of 1/255, colours as JPEG; poses and
+    intrinsics exactly. Depths beyond what float16 holds of the window's median become unknown.
+
+    Args:
+        path: the file to be, ``*.npz``.
+        prediction: a backbone's view of the window.
+        colors: (N, H, W, 3) RGB uint8, at the size of the depth maps.
+
+    Returns:
+        The prediction as ``load_prediction`` gives it back, so that a run that goes on with it
+        ends as one that was broken off and resumed.
+
+    Raises:
+        RunFolderError: the system could not write.
+    """
+    packed = _pack(prediction)
+    jpegs = [_encode_jpeg(image) for image in colors]
+    with atomic_write(path) as partial, partial.open("wb") as file:
+        np.savez(
+            file,
+            allow_pickle=False,
+            **packed,
+            jpeg=np.frombuffer(b"".join(jpegs), np.uint8),
+            jpeg_sizes=np.array([len(jpeg) for jpeg in jpegs], np.int64),
+        )
+    return _unpack(packed)
+
+
+def load_prediction(path: Path) -> tuple[Prediction, Image]:
+    """Read what ``save_prediction`` wrote.
+
+    Returns:
+        The prediction, and its (N, H, W, 3) RGB uint8 colours.
+
+    Raises:
+        RunFolderError: the file is missing, damaged or of another version.
+    """
+    with _reading(path):
+        arrays = _arrays_of(path)
+        return _unpack(arrays), _decode_jpegs(arrays["jpeg"], arrays["jpeg_sizes"])
+
+
+def save_layers(path: Path, layers: Layers) -> None:
+    """Write the layers of one window, beside its depth as it was predicted.
+
+    Args:
+        path: the file to be, ``*.npz``.
+        layers: of the window.
+
+    Raises:
+        RunFolderError: the system could not write.
+    """
+    with atomic_write(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(
+            file, allow_pickle=False, version=np.array(FORMAT_VERSION), **vars(layers)
+        )
+
+
+def load_layers(path: Path) -> Layers:
+    """Read what ``save_layers`` wrote.
+
+    Raises:
+        RunFolderError: the file is missing, damaged or of another version.
+    """
+    with _reading(path):
+        arrays = _arrays_of(path)
+        return Layers(**{field.name: arrays[field.name] for field in fields(Layers)})
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Say of what is wrong with a file that it is this file, and what to do."""
+    try:
+        yield
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise RunFolderError(
+            f"cannot read window file {path}: {text}; delete it and run again"
+        ) from error
+
+
+def _arrays_of(path: Path) -> dict[str, NDArray[Any]]:
+    with np.load(path, allow_pickle=False) as file:
+        arrays = {key: file[key] for key in file.files}
+    version = int(arrays["version"])
+    if version != FORMAT_VERSION:
+        raise RunFolderError(
+            f"window file {path} has format {version}, this laser-slam reads {FORMAT_VERSION}; "
+            "delete its run folder and run again"
+        )
+    return arrays
+
+
+def _pack(prediction: Prediction) -> dict[str, NDArray[Any]]:
+    known = prediction.depth[prediction.depth > 0]
+    unit = float(np.median(known)) if known.size else 1.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        depth = (prediction.depth / np.float32(unit)).astype(np.float16)
+        # Outside float16's normal range the relative error would be anything.
+        lost = ~(np.isfinite(depth) & (np.abs(depth) >= np.finfo(np.float16).tiny))
+    depth[lost] = np.nan
+    confidence = np.where(lost, 0, np.rint(prediction.confidence * 255)).astype(np.uint8)
+    return {
+        "version": np.array(FORMAT_VERSION),
+        "frames": prediction.frames,
+        "depth": depth,
+        "unit": np.array(unit),
+        "confidence": confidence,
+        "window_from_cam": prediction.window_from_cam,
+        "intrinsics": prediction.intrinsics,
+        "status": np.array(prediction.status.value),
+        "warnings": np.array(prediction.warnings, dtype=np.str_),
+    }
+
+
+def _unpack(arrays: dict[str, NDArray[Any]]) -> Prediction:
+    return Prediction(
+        frames=arrays["frames"],
+        depth=arrays["depth"].astype(np.float32) * np.float32(arrays["unit"]),
+        confidence=arrays["confidence"].astype(np.float32) / np.float32(255),
+        window_from_cam=arrays["window_from_cam"],
+        intrinsics=arrays["intrinsics"],
+        status=WindowStatus(str(arrays["status"])),
+        warnings=tuple(str(warning) for warning in arrays["warnings"]),
+    )
+
+
+def _encode_jpeg(image: Image) -> bytes:
+    buffer = io.BytesIO()
+    PIL.Image.fromarray(image).save(buffer, "JPEG", quality=JPEG_QUALITY)
+    return buffer.getvalue()
+
+
+def _decode_jpegs(data: Image, sizes: NDArray[np.int64]) -> Image:
+    parts = np.split(data, np.cumsum(sizes)[:-1])
+    return np.stack([np.asarray(PIL.Image.open(io.BytesIO(part.tobytes()))) for part in parts])
