@@ -102,6 +102,35 @@ class SegmentationConfig(_Section):
     downscale: int = Field(
         2, ge=1, le=8, description="layers are found on every so many-th row and column"
     )
+    depth: Literal["log", "inverse", "linear"] = Field(
+        "log",
+        description="what is segmented; linear: raw depth, whose layers depend on its unit",
+    )
+    scale: float = Field(
+        300.0, gt=0, description="255 k of Felzenszwalb's threshold k / size: larger, fewer layers"
+    )
+    sigma: float = Field(1.1, ge=0, le=10, description="blur before, in cells of the label map")
+    min_share: float = Field(
+        0.003, ge=0, le=1, description="smaller layers join a neighbour, share of the image's area"
+    )
+    min_size_px: int = Field(
+        0, ge=0, description="the same in px of the depth map; 0: min_share decides"
+    )
+    merge: float = Field(
+        0.01, ge=0, lt=1, description="neighbours closer than this share of the window's range join"
+    )
+    merge_rule: Literal["robust", "range"] = Field(
+        "robust",
+        description="robust: 2..98 % of the values, means follow; range: max - min of the "
+        "confident ones, chained as in the official code",
+    )
+    label_folder: str = Field(
+        "", description="label maps of 'label_files', named by frame: 000012.png or .npy"
+    )
+    sam2_config: str = Field(
+        "configs/sam2.1/sam2.1_hiera_l.yaml", description="model settings of 'sam2'"
+    )
+    sam2_checkpoint: str = Field("", description="weights file of 'sam2', a .pt")
 
 
 class LayersConfig(_Section):
@@ -141,6 +170,23 @@ class LayersConfig(_Section):
     feather: float = Field(
         16, ge=0, description="px over which scales blend where a surface goes on; 0: not at all"
     )
+
+
+class PoseGraphConfig(_Section):
+    """The places of all windows, from registrations and closures."""
+
+    inlier_probability: float = Field(
+        0.9999, gt=0.5, lt=1, description="share of right closures that pass the chi-square test"
+    )
+    cauchy_width: float = Field(
+        1.0, gt=0, description="misfit, in sigmas, beyond which the kernel doubts a closure"
+    )
+    max_stretch: float = Field(
+        10.0,
+        ge=1,
+        description="how many times its sigmas the chain may err where closures agree on it",
+    )
+    max_iterations: int = Field(100, ge=1, description="of one run of the solver")
 
 
 class FusionConfig(_Section):
@@ -195,6 +241,14 @@ class Config(_Section):
     backbone: BackboneConfig = BackboneConfig()
     registration: RegistrationConfig = RegistrationConfig()
     layers: LayersConfig = LayersConfig()
+    pose_graph: PoseGraphConfig = PoseGraphConfig()
     fusion: FusionConfig = FusionConfig()
     synthetic: SyntheticConfig = SyntheticConfig()
     run: RunConfig = RunConfig()
+
+    @property
+    def has_layers(self) -> bool:
+        """Tell whether layers are aligned: auto means for every backbone but ``classical``."""
+        if self.layers.enabled == "auto":
+            return self.backbone.name != "classical"
+        return self.layers.enabled == "always"

@@ -1,0 +1,75 @@
+"""Segmenters: the depth maps of one window to layers."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.errors import ConfigError
+from laser_slam.types import Image, Prediction
+
+if TYPE_CHECKING:
+    from laser_slam.config import SegmentationConfig
+
+SEGMENTERS = {
+    "felzenszwalb": "laser_slam.layers.felzenszwalb:FelzenszwalbSegmenter",
+    "label_files": "laser_slam.layers.label_files:LabelFileSegmenter",
+    "sam2": "laser_slam.layers.sam2:Sam2Segmenter",
+}
+MAX_LAYERS = int(np.iinfo(np.uint16).max)
+
+
+class Segmenter(Protocol):
+    """Cuts depth maps into layers: surfaces at about one depth."""
+
+    def segment(self, window: Prediction, colors: Image) -> NDArray[np.uint16]:
+        """Label the frames of one window.
+
+        Args:
+            window: its depth decides what is unknown.
+            colors: (N, H, W, 3) RGB uint8, at the size of the depth maps.
+
+        Returns:
+            (N, ceil(H / f), ceil(W / f)) labels, where f is the setting ``downscale``: in each
+            frame from 1 without gaps; 0: depth unknown. Cell (i, j) stands for the f x f block
+            of pixels that starts at (i f, j f).
+        """
+        ...
+
+
+def make_segmenter(config: SegmentationConfig) -> Segmenter:
+    """Import and build the segmenter that the settings name.
+
+    Raises:
+        ConfigError: no segmenter has this name.
+    """
+    if config.segmenter not in SEGMENTERS:
+        raise ConfigError(
+            f"layers.segmentation.segmenter: no '{config.segmenter}'; "
+            f"there is {', '.join(SEGMENTERS)}"
+        )
+    module, _, attribute = SEGMENTERS[config.segmenter].partition(":")
+    segmenter: Segmenter = getattr(import_module(module), attribute)(config)
+    return segmenter
+
+
+def close_gaps(labels: NDArray[np.integer]) -> NDArray[np.uint16]:
+    """Number (h, w) labels from 1 without gaps, in their order; 0 stays 0.
+
+    Raises:
+        ConfigError: more layers than 16 bits can count.
+
+    >>> close_gaps(np.array([[0, 7], [300, 7]]))
+    array([[0, 1],
+           [2, 1]], dtype=uint16)
+    """
+    old, places = np.unique(np.append(labels.ravel(), 0), return_inverse=True)
+    if len(old) - 1 > MAX_LAYERS:
+        raise ConfigError(
+            f"a frame falls into {len(old) - 1} layers, at most {MAX_LAYERS} can be: "
+            "raise layers.segmentation.min_share or downscale, or use label maps with fewer labels"
+        )
+    return places[:-1].reshape(labels.shape).astype(np.uint16)
