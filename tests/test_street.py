@@ -31,7 +31,7 @@ def world_points(frame: int) -> np.ndarray:
 
 
 def log_ratio(pair: Pair, window: Prediction, scale: float = 1.0) -> np.ndarray:
-    return np.log(scale * window.depth / pair.truth(window))
+    return np.asarray(np.log(scale * window.depth / pair.truth(window)))
 
 
 def test_every_frame_sees_ground_sky_and_a_dozen_objects_before_the_sky() -> None:
