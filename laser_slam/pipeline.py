@@ -102,7 +102,7 @@ class Pipeline:
         self._dataset = dataset
         self._config = config
         self._info = dataset.info
-        self.backbone = backbone or make_backbone(config.backbone)
+        self.backbone = backbone or make_backbone(config.backbone, self._info, dataset.true_depth)
         self._on_progress = on_progress
         self._slam = Slam(config)
         self._size = self.backbone.image_size(self._info.size)

@@ -2,26 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 from laser_slam.errors import ConfigError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from laser_slam.backbones.base import Backbone
     from laser_slam.config import BackboneConfig
+    from laser_slam.types import SequenceInfo
 
-BACKBONES = {"classical": "laser_slam.backbones.classical:ClassicalBackbone"}
+BACKBONES = {
+    "classical": "laser_slam.backbones.classical:ClassicalBackbone",
+    "simulated": "laser_slam.backbones.simulated:SimulatedBackbone",
+}
+FROM_TRUTH = {"simulated"}  # these are made from what the data set knows, too
 
 
-def make_backbone(config: BackboneConfig) -> Backbone:
+def make_backbone(
+    config: BackboneConfig,
+    info: SequenceInfo | None = None,
+    true_depth: Callable[[int], NDArray[np.float32] | None] | None = None,
+) -> Backbone:
     """Import and build the backbone that the settings name.
 
+    Args:
+        config: its name and settings.
+        info: of the data set, for a backbone that simulates; None: there is none.
+        true_depth: (H, W) metres of a frame of the data set, NaN: unknown; None: there is none.
+
     Raises:
-        ConfigError: no backbone has this name.
+        ConfigError: no backbone has this name, or it simulates and the data set has no truth.
     """
     if config.name not in BACKBONES:
         raise ConfigError(f"backbone.name: no '{config.name}'; there is {', '.join(BACKBONES)}")
     module, _, attribute = BACKBONES[config.name].partition(":")
-    backbone: Backbone = getattr(import_module(module), attribute)(config)
+    truth = (info, true_depth) if config.name in FROM_TRUTH else ()
+    backbone: Backbone = getattr(import_module(module), attribute)(config, *truth)
     return backbone

@@ -15,6 +15,7 @@ from laser_slam.config.sections import (
     SyntheticConfig,
     WindowsConfig,
 )
+from laser_slam.config.simulated import SimulatedConfig
 
 __all__ = [
     "BackboneConfig",
@@ -27,6 +28,7 @@ __all__ = [
     "RegistrationConfig",
     "RunConfig",
     "SegmentationConfig",
+    "SimulatedConfig",
     "SyntheticConfig",
     "WindowsConfig",
     "dump_config",

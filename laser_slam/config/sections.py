@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-
-class _Section(BaseModel):
-    """A frozen group of settings that refuses unknown names."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+from laser_slam.config.section import Section as _Section
+from laser_slam.config.simulated import SimulatedConfig
 
 
 class DatasetConfig(_Section):
@@ -71,6 +68,7 @@ class BackboneConfig(_Section):
 
     name: str = Field("classical", description="one of the names in laser_slam.backbones.BACKBONES")
     classical: ClassicalConfig = ClassicalConfig()
+    simulated: SimulatedConfig = SimulatedConfig()
 
 
 class RegistrationConfig(_Section):
@@ -147,6 +145,9 @@ class LayersConfig(_Section):
         0.3, ge=0, lt=1, description="IoU above which layers of consecutive frames are linked"
     )
     intra: bool = Field(True, description="scales go on from frame to frame; false: 'w/o intra'")
+    follow: bool = Field(
+        True, description="layers are carried along by depth and poses; false: the same pixels"
+    )
     scale: Literal["median", "huber", "l1", "closed_form"] = Field(
         "median", description="estimator of a layer's scale; huber: the paper's, in metric depth"
     )
