@@ -31,6 +31,8 @@ from laser_slam.registration import register
 Array = NDArray[np.float64]
 
 COLUMNS = (
+    "case",
+    "settings",
     "scale off %",
     "rotation off °",
     "AbsRel overlap",
@@ -63,14 +65,20 @@ class Row:
         return [self.case, self.settings, f"{scale:.2f}", f"{turn:.3f}", *arrows, f"{layers:.1f}"]
 
 
-def measure(pair: Pair, config: Config) -> Array:
-    """Register and align the second window of a pair; return the figures of a row."""
+def measure(pair: Pair, config: Config, witnesses: float) -> Array:
+    """Register and align the second window of a pair; return the figures of a row.
+
+    Args:
+        pair: the windows and the truth.
+        config: all settings.
+        witnesses: windows that the first one stands for; it is the truth, but nothing says so.
+    """
     registration = register(pair.previous, pair.current, config.registration)
     scale = registration.previous_from_current.scale
     segmenter = make_segmenter(config.layers.segmentation)
     first = first_layers(segmenter.segment(pair.previous, pair.colors(pair.previous)))
     labels = segmenter.segment(pair.current, pair.colors(pair.current))
-    before = (pair.previous, first)
+    before = (pair.previous, replace(first, witnesses=witnesses * first.witnesses))
     layers, _ = align_layers(before, pair.current, labels, scale, config.layers)
     corrected = apply_layers(pair.current, layers, config.layers)
     old, new = score(pair, pair.current, scale), score(pair, corrected, scale)
@@ -118,17 +126,18 @@ def changed_cases(cases: str, changes: Sequence[str]) -> Iterator[tuple[str, Cas
             yield label, replace(case, **change)
 
 
-def print_table(rows: Sequence[Row], title: str, *, markdown: bool) -> None:
+def print_table(
+    header: Sequence[str], rows: Sequence[Sequence[str]], title: str, *, markdown: bool
+) -> None:
     """Print the rows, as Markdown or in columns."""
-    header = ["case", "settings", *COLUMNS]
     if markdown:
-        lines = [header, ["---"] * len(header), *(row.cells() for row in rows)]
+        lines = [header, ["---"] * len(header), *rows]
         print(f"{title}\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines))
         return
     table = Table(*header, title=title)
     for row in rows:
-        table.add_row(*row.cells())
-    Console(width=None if Console().is_terminal else 200).print(table)
+        table.add_row(*row)
+    Console(width=None if Console().is_terminal else 220).print(table)
 
 
 def main(  # noqa: PLR0913, PLR0917  (the options of a command)
@@ -145,6 +154,9 @@ def main(  # noqa: PLR0913, PLR0917  (the options of a command)
         typer.Option("--change", help="of the cases, such as unit=0.01,1 or outlier_confidence=0"),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="streets to average over")] = 3,
+    witnesses: Annotated[
+        float, typer.Option(min=1, help="windows that the first one stands for, see layers.memory")
+    ] = 1,
     tall: Annotated[bool, typer.Option("--tall", help="294x518 instead of 154x518")] = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="print Markdown")] = False,
 ) -> None:
@@ -156,20 +168,17 @@ def main(  # noqa: PLR0913, PLR0917  (the options of a command)
         figures: dict[tuple[str, str], list[Array]] = {
             (label, name): [] for label, _ in chosen for name in configs
         }
-        console = Console(stderr=True)
         work = list(itertools.product(range(seeds), chosen))
-        for seed, (label, case) in track(
-            work, "streets", console=Console(stderr=True), transient=True
-        ):
+        for seed, (label, case) in track(work, "streets", console=Console(stderr=True)):
             pair = make_pair(case, seed, size)
             for name, config in configs.items():
-                figures[label, name].append(measure(pair, config))
+                figures[label, name].append(measure(pair, config, witnesses))
     except LaserSlamError as error:
         typer.echo(f"ablate_street: {error}", err=True)
         raise typer.Exit(1) from error
-    rows = [Row(*key, np.mean(values, axis=0)) for key, values in figures.items()]
+    rows = [Row(*key, np.mean(values, axis=0)).cells() for key, values in figures.items()]
     title = f"Before → after, {size[0]}x{size[1]}, mean of {seeds} streets, sky left out"
-    print_table(rows, title, markdown=markdown)
+    print_table(COLUMNS, rows, title, markdown=markdown)
 
 
 if __name__ == "__main__":
