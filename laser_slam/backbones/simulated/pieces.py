@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.backbones.simulated.piece_kernels import Ground, object_keys
+from laser_slam.backbones.simulated.piece_kernels import Ground, no_seeds, object_keys
 from laser_slam.camera import unproject
 
 Array = NDArray[np.float64]
@@ -65,9 +65,10 @@ class Pieces:
         rotation = self.level_from_world @ world_from_cam[:3, :3]
         level_from_pixel[:, :3] = rotation @ np.linalg.inv(intrinsics)
         level_from_pixel[:, 3] = self.level_from_world @ world_from_cam[:3, 3]
-        return np.asarray(
-            object_keys(depth, level_from_pixel / self.median_m, self.size, ground, self.salt)
-        )
+        level_from_pixel /= self.median_m
+        out = np.zeros(depth.shape, np.uint64)
+        object_keys(depth, level_from_pixel, self.size, ground, self.salt, no_seeds(), out)
+        return out
 
     def _level(self, points: Array, world_from_cam: Array) -> Array:
         """Return the known points as (M, 3) in level axes and median depths."""
