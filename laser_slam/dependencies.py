@@ -32,6 +32,24 @@ def import_open3d() -> Any:
     return open3d
 
 
+@cache
+def import_gtsam() -> Any:
+    """Import GTSAM, whose Sim(3) factors exist since 4.3 only.
+
+    Raises:
+        DependencyError: GTSAM is missing, cannot be loaded or is too old; says how to get it.
+    """
+    try:
+        import gtsam  # noqa: PLC0415  (slow, and only the pose graph needs it)
+
+        _ = gtsam.BetweenFactorSimilarity3  # since 4.3
+    except (ImportError, OSError, AttributeError) as error:
+        raise DependencyError(
+            f"GTSAM cannot be loaded or is too old ({error}); install it: pip install 'gtsam>=4.3'"
+        ) from error
+    return gtsam
+
+
 def _preload_libusb() -> None:
     try:
         import libusb_package  # noqa: PLC0415

@@ -191,6 +191,37 @@ def interpolate_poses(times_s: Array, key_times_s: Array, world_from_key: Array)
     return out
 
 
+def interpolate_sim3(first: Sim3, second: Sim3, shares: Array) -> list[Sim3]:
+    """Go from one similarity to another at a constant rate of turning, growing and moving.
+
+    The way does not depend on the choice of either frame.
+
+    Args:
+        first: where share 0 is.
+        second: where share 1 is; a rotation by less than half a turn away.
+        shares: (M,) how far along the way.
+    """
+    step = first.inverse() @ second
+    turn, growth = rotation_log(step.rotation), float(np.log(step.scale))
+    drift = np.linalg.solve(_mean_motion(turn[None], np.array([growth]))[0], step.translation)
+    turns, growths = shares[:, None] * turn, shares * growth
+    moves = shares[:, None] * (_mean_motion(turns, growths) @ drift)
+    rotations = rotation_exp(turns)
+    return [first @ Sim3(*part) for part in zip(np.exp(growths), rotations, moves, strict=True)]
+
+
+def _mean_motion(turns: Array, growths: Array) -> Array:
+    """Return the (M, 3, 3) means of scaled rotations on the way to (M, 3) turns and (M,) growths.
+
+    Gauss's quadrature is exact to rounding for up to half a turn, and knows no small angle.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(16)
+    parts = (nodes + 1) / 2
+    rotations = rotation_exp(parts[:, None] * turns[:, None, :])
+    shares = weights / 2 * np.exp(parts * growths[:, None])
+    return np.asarray((shares[..., None, None] * rotations).sum(axis=1))
+
+
 def complete_poses(frames: NDArray[np.int64], known: NDArray[np.int64], poses: Array) -> Array:
     """Give every frame a pose: interpolated between known ones, beyond them at their last speed.
 

@@ -105,17 +105,17 @@ class SegmentationConfig(_Section):
         description="what is segmented; linear: raw depth, whose layers depend on its unit",
     )
     scale: float = Field(
-        300.0, gt=0, description="255 k of Felzenszwalb's threshold k / size: larger, fewer layers"
+        30.0, gt=0, description="255 k of Felzenszwalb's threshold k / size: larger, fewer layers"
     )
-    sigma: float = Field(1.1, ge=0, le=10, description="blur before, in cells of the label map")
+    sigma: float = Field(0.6, ge=0, le=10, description="blur before, in cells of the label map")
     min_share: float = Field(
-        0.003, ge=0, le=1, description="smaller layers join a neighbour, share of the image's area"
+        0.002, ge=0, le=1, description="smaller layers join a neighbour, share of the image's area"
     )
     min_size_px: int = Field(
         0, ge=0, description="the same in px of the depth map; 0: min_share decides"
     )
     merge: float = Field(
-        0.01, ge=0, lt=1, description="neighbours closer than this share of the window's range join"
+        0.0, ge=0, lt=1, description="neighbours closer than this share of the window's range join"
     )
     merge_rule: Literal["robust", "range"] = Field(
         "robust",
@@ -139,10 +139,10 @@ class LayersConfig(_Section):
     )
     segmentation: SegmentationConfig = SegmentationConfig()
     tau_inter: float = Field(
-        0.3, ge=0, lt=1, description="IoU above which layers of two windows are linked"
+        0.1, ge=0, lt=1, description="IoU above which layers of two windows are linked"
     )
     tau_intra: float = Field(
-        0.3, ge=0, lt=1, description="IoU above which layers of consecutive frames are linked"
+        0.1, ge=0, lt=1, description="IoU above which layers of consecutive frames are linked"
     )
     intra: bool = Field(True, description="scales go on from frame to frame; false: 'w/o intra'")
     follow: bool = Field(
