@@ -141,7 +141,7 @@ def add_noise(
             z = blob_factors[blob] * law.unit * np.exp(np.float32(error)) / here
             doubt = NOISE_WEIGHT * variance + FAR_WEIGHT / here
             doubt += min(EDGE_WEIGHT * _bend(inverse, y, x), MAX_EDGE)
-            vague = VAGUE_PENALTY * np.exp(np.float32(0.5) * fields[2, y, x])
+            vague = VAGUE_PENALTY * np.exp(fields[2, y, x])
             sure = 1 / (1 + law.confidence_told * doubt + (1 - law.confidence_told) * vague)
             if blob > 0:
                 sure *= 1 - law.blob_told
