@@ -222,7 +222,7 @@ class PoseGraph:
 
 
 def _measured_link(a: int, b: int, a_from_b: Sim3, sigmas: Array) -> Link:
-    information: Array = np.linalg.inv(local_covariance(a_from_b, sigmas))
+    information = np.asarray(np.linalg.inv(local_covariance(a_from_b, sigmas)), np.float64)
     return Link(a, b, a_from_b, information)
 
 
