@@ -20,10 +20,10 @@ from laser_slam.bookkeeping import FrameLog, StageClock, identify, run_log
 from laser_slam.camera import resize_intrinsics
 from laser_slam.config import Config
 from laser_slam.datasets.base import Dataset
-from laser_slam.errors import RunFolderError
 from laser_slam.evaluation.trajectory import evaluate_trajectory
 from laser_slam.export import write_ply
 from laser_slam.fusion import fuse
+from laser_slam.layers import apply_layers
 from laser_slam.rectification import Rectifier, load_calibration, save_calibration
 from laser_slam.report import stages_picture
 from laser_slam.results import (
@@ -42,13 +42,7 @@ from laser_slam.results import (
 )
 from laser_slam.sim3 import interpolate_poses
 from laser_slam.slam import Slam
-from laser_slam.store import (
-    link_latest,
-    load_prediction,
-    new_run_folder,
-    open_run_folder,
-    save_prediction,
-)
+from laser_slam.store import WindowFiles, link_latest, new_run_folder, open_run_folder
 from laser_slam.types import (
     NO_DISTORTION,
     Calibration,
@@ -104,7 +98,8 @@ class Pipeline:
         self._info = dataset.info
         self.backbone = backbone or make_backbone(config.backbone, self._info, dataset.true_depth)
         self._on_progress = on_progress
-        self._slam = Slam(config)
+        self._clock = StageClock()
+        self._slam = Slam(config, self._clock.stage)
         self._size = self.backbone.image_size(self._info.size)
         self._calibration = Calibration(
             self._given(), NO_DISTORTION, self._size, self._info.intrinsics_source
@@ -112,10 +107,10 @@ class Pipeline:
         self._rectifier = Rectifier(self._calibration, self._size)
         self._input = FrameLog()
         self._intrinsics: list[NDArray[np.float64]] = []
-        self._clock = StageClock()
         self._is_named_here = out is None
         self._is_complete = False
         self.folder = Path(os.path.normpath(out)) if out else new_run_folder(self._info.name)
+        self._files = WindowFiles(self.folder)
 
     def run(self) -> Results:
         """Map the sequence.
@@ -189,15 +184,10 @@ class Pipeline:
 
     def _predict(self, window: Window) -> tuple[Prediction, Image]:
         """Ask the backbone, or read what it said of this window before the run was broken off."""
-        path = self._window_file(window.index)
-        if path.exists() and (self._is_complete or not self.backbone.remembers):
+        is_usable = self._is_complete or not self.backbone.remembers
+        if is_usable and self._files.has(window.index):
             with self._clock.stage("load"):
-                prediction, colors = load_prediction(path)
-            if not np.array_equal(prediction.frames, window.frames):
-                raise RunFolderError(
-                    f"{path} holds other frames than window {window.index} of this input; "
-                    "choose another folder with --out"
-                )
+                prediction, colors = self._files.load(window.index, window.frames)
         else:
             with self._clock.stage("predict"):
                 prediction = self.backbone.predict(
@@ -205,14 +195,16 @@ class Pipeline:
                 )
             with self._clock.stage("store"):
                 colors = _resize(window.images, prediction.depth.shape[1:])
-                prediction = save_prediction(path, prediction, colors)
+                prediction = self._files.save(window.index, prediction, colors)
         for warning in prediction.warnings:
             logger.warning("window %d: %s", window.index, warning)
         return prediction, colors
 
     def _place(self, prediction: Prediction, colors: Image) -> None:
-        with self._clock.stage("register"):
-            self._slam.add(prediction, colors)
+        self._slam.add(prediction, colors)
+        if self._slam.layers is not None:
+            with self._clock.stage("store"):
+                self._files.save_layers(self._slam.nodes[-1].index, self._slam.layers)
         size = (prediction.depth.shape[1], prediction.depth.shape[2])
         self._intrinsics.append(resize_intrinsics(prediction.intrinsics[0], size, self._info.size))
         self._on_progress("mapping", len(self._input.times_s), self._info.num_frames)
@@ -284,10 +276,12 @@ class Pipeline:
         }
 
     def _load(self, index: int) -> tuple[Prediction, Image]:
-        return load_prediction(self._window_file(index))
-
-    def _window_file(self, index: int) -> Path:
-        return self.folder / "windows" / f"{index:06d}.npz"
+        """Read a window back, its layers' scales applied."""
+        prediction, colors = self._files.load(index)
+        if self._config.has_layers:
+            layers = self._files.load_layers(index)
+            prediction = apply_layers(prediction, layers, self._config.layers)
+        return prediction, colors
 
 
 def _resize(images: tuple[Image, ...], size: tuple[int, ...]) -> Image:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,13 +12,35 @@ from numpy.typing import NDArray
 
 from laser_slam.config import Config
 from laser_slam.errors import DegenerateGeometryError
+from laser_slam.layers import (
+    LayerCounts,
+    Segmenter,
+    align_layers,
+    apply_layers,
+    first_layers,
+    make_segmenter,
+)
 from laser_slam.registration import bridge, register
 from laser_slam.sim3 import Sim3, complete_poses
-from laser_slam.types import Image, Prediction, Registration, Submap, Trajectory, WindowStatus
+from laser_slam.types import (
+    Image,
+    Layers,
+    Prediction,
+    Registration,
+    Submap,
+    Trajectory,
+    WindowStatus,
+)
 
 Array = NDArray[np.float64]
 
+Stage = Callable[[str], AbstractContextManager[None]]
 logger = logging.getLogger(__name__)
+
+
+def no_clock(_name: str) -> AbstractContextManager[None]:
+    """Charge nothing."""
+    return nullcontext()
 
 
 @dataclass(frozen=True)
@@ -30,6 +54,7 @@ class Node:
         world_from_window: Sim(3); world units are the units of the first window.
         owned: first frame that this window owns, and the first that it no longer does.
         registration: to the window before; None for the first.
+        layers: what became of its layers; None: they were not looked at.
     """
 
     index: int
@@ -38,6 +63,7 @@ class Node:
     world_from_window: Sim3
     owned: tuple[int, int]
     registration: Registration | None
+    layers: LayerCounts | None = None
 
     @property
     def is_owned(self) -> NDArray[np.bool_]:
@@ -45,7 +71,7 @@ class Node:
         return (self.frames >= self.owned[0]) & (self.frames < self.owned[1])
 
     def submap(self, prediction: Prediction, colors: Image) -> Submap:
-        """Join the node with its window's prediction, read back from disk perhaps."""
+        """Join the node with its window's prediction, layers applied, from disk perhaps."""
         if prediction.status is WindowStatus.FAILED:  # its own poses mean nothing
             prediction = replace(prediction, window_from_cam=self.window_from_cam)
         return Submap(
@@ -65,15 +91,27 @@ class Slam:
 
     Attributes:
         nodes: the places of all windows so far, in order.
+        layers: of the window added last; None: they are not looked at.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, stage: Stage = no_clock) -> None:
+        """Start with no window.
+
+        Args:
+            config: all settings.
+            stage: is entered with the name of what is being done, to charge time to it.
+        """
         self._config = config
+        self._stage = stage
         self._last: Prediction | None = None
+        self._segmenter: Segmenter | None = None
+        if config.has_layers:
+            self._segmenter = make_segmenter(config.layers.segmentation)
         self.nodes: list[Node] = []
+        self.layers: Layers | None = None
 
     def add(self, prediction: Prediction, colors: Image) -> Submap:
-        """Place the next window.
+        """Place the next window and align its layers with those of the window before.
 
         A window that cannot be registered is bridged: one warning, and ``bridged`` names it.
 
@@ -91,14 +129,23 @@ class Slam:
             first_from_window = Sim3.from_matrix(placed.window_from_cam[0]).inverse()
             self._append(placed, first_from_window, None)
         else:
-            registration = self._register(self._last, placed)
+            with self._stage("register"):
+                registration = self._register(self._last, placed)
             self._split_shared_frames(placed)
             world_from_previous = self.nodes[-1].world_from_window
             self._append(
                 placed, world_from_previous @ registration.previous_from_current, registration
             )
+        with self._stage("layers"):
+            self._align_layers(placed, colors)
         self._last = placed
-        return self.nodes[-1].submap(prediction, colors)
+        return self.nodes[-1].submap(self.corrected(prediction), colors)
+
+    def corrected(self, prediction: Prediction) -> Prediction:
+        """Return the window added last with its layers' scales applied."""
+        if self.layers is None:
+            return prediction
+        return apply_layers(prediction, self.layers, self._config.layers)
 
     @property
     def bridged(self) -> dict[int, str]:
@@ -127,6 +174,20 @@ class Slam:
         ]
         owned = np.concatenate(frames)
         return Trajectory(owned, times_s[owned], np.concatenate(poses))
+
+    def _align_layers(self, placed: Prediction, colors: Image) -> None:
+        if self._segmenter is None:
+            return
+        labels = self._segmenter.segment(placed, colors)
+        registration = self.nodes[-1].registration
+        previous = None if self._last is None or self.layers is None else (self._last, self.layers)
+        if previous is None or registration is None or registration.bridged:
+            self.layers = first_layers(labels)  # there is no scale that layers could differ from
+            counts = LayerCounts(len(self.layers.scales))
+        else:
+            scale = registration.previous_from_current.scale
+            self.layers, counts = align_layers(previous, placed, labels, scale, self._config.layers)
+        self.nodes[-1] = replace(self.nodes[-1], layers=counts)
 
     def _append(
         self, placed: Prediction, world_from_window: Sim3, registration: Registration | None

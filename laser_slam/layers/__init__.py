@@ -5,5 +5,14 @@ Reference: LASER (arXiv:2512.13680), section 3.2.
 
 from laser_slam.layers.alignment import LayerCounts, align_layers, first_layers
 from laser_slam.layers.correction import apply_layers
+from laser_slam.layers.segmenters import SEGMENTERS, Segmenter, make_segmenter
 
-__all__ = ["LayerCounts", "align_layers", "apply_layers", "first_layers"]
+__all__ = [
+    "SEGMENTERS",
+    "LayerCounts",
+    "Segmenter",
+    "align_layers",
+    "apply_layers",
+    "first_layers",
+    "make_segmenter",
+]

@@ -18,6 +18,39 @@ def count_pairs(first, second, num_first, num_second):
 
 
 @njit(cache=True, nogil=True)
+def carry_labels(labels, there, here, pixel_there_from_here, block):
+    """Return the (h, w) labels that another frame gives to what this frame's cells show.
+
+    Args:
+        labels: (h, w) of the other frame.
+        there: (h, w) its depth.
+        here: (h, w) this frame's depth; unknown depth gets label 0, as does what the other frame
+            does not see: out of the image, or behind something.
+        pixel_there_from_here: (3, 4) maps depth times (u, v, 1) and 1 to the other frame's depth
+            times (u, v, 1); pixels.
+        block: pixels that a cell has a side.
+    """
+    height, width = labels.shape
+    out = np.zeros((height, width), labels.dtype)
+    M = pixel_there_from_here
+    for v in range(height):
+        for u in range(width):
+            z = here[v, u]
+            if not z > 0:
+                continue
+            x, y = z * u * block, z * v * block
+            depth = M[2, 0] * x + M[2, 1] * y + M[2, 2] * z + M[2, 3]
+            if not depth > 0:
+                continue
+            column = int((M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3]) / depth / block + 0.5)
+            row = int((M[1, 0] * x + M[1, 1] * y + M[1, 2] * z + M[1, 3]) / depth / block + 0.5)
+            if 0 <= row < height and 0 <= column < width:
+                if abs(there[row, column] - depth) < 0.15 * depth:
+                    out[v, u] = labels[row, column]
+    return out
+
+
+@njit(cache=True, nogil=True)
 def smooth_along_surfaces(values, log_depth, reach, max_step):
     """Smooth (h, w) values in place along rows and columns, but not across steps of depth.
 

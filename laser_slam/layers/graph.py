@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.layers.alignment_kernels import count_pairs
+from laser_slam.layers.alignment_kernels import carry_labels, count_pairs
+from laser_slam.types import Prediction
 
 Indices = NDArray[np.int64]
 Labels = NDArray[np.uint16]
@@ -31,6 +32,10 @@ class Edges:
 
     def __len__(self) -> int:
         return len(self.parent)
+
+    def chosen(self, mask: NDArray[np.bool_]) -> Edges:
+        """Return some of the edges."""
+        return Edges(self.parent[mask], self.child[mask], self.iou[mask], self.frame[mask])
 
 
 def first_rows(labels: Labels) -> Indices:
@@ -57,19 +62,37 @@ def inter_window_edges(
     return _joined(found)
 
 
-def intra_window_edges(labels: Labels, starts: Indices, tau: float) -> Edges:
+def intra_window_edges(
+    labels: Labels, starts: Indices, tau: float, window: Prediction | None, block: int
+) -> Edges:
     """Link the layers of consecutive frames of one window.
 
     Args:
         labels: (N, h, w).
         starts: (N + 1,) of the rows.
         tau: IoU that an edge must exceed.
+        window: carries each layer to where the next frame sees it, by its depth and poses; None:
+            the same pixels are compared, as if the camera stood still.
+        block: pixels that a label's cell has a side.
     """
-    found = [
-        _edges((labels[i - 1], starts[i - 1]), (labels[i], starts[i]), tau, i)
-        for i in range(1, len(labels))
-    ]
+    found = []
+    for i in range(1, len(labels)):
+        before = labels[i - 1] if window is None else _carried(labels[i - 1], window, i, block)
+        found.append(_edges((before, starts[i - 1]), (labels[i], starts[i]), tau, i))
     return _joined(found)
+
+
+def _carried(before: Labels, window: Prediction, frame: int, block: int) -> Labels:
+    """Return the labels of the frame before as this frame's cells see them."""
+    K = window.intrinsics
+    before_from_here = (
+        np.linalg.inv(window.window_from_cam[frame - 1]) @ window.window_from_cam[frame]
+    )
+    pixel_there_from_here = K[frame - 1] @ before_from_here[:3]
+    pixel_there_from_here[:, :3] = pixel_there_from_here[:, :3] @ np.linalg.inv(K[frame])
+    there, here = (window.depth[i, ::block, ::block] for i in (frame - 1, frame))
+    out: Labels = carry_labels(before, there, here, pixel_there_from_here, block)
+    return out
 
 
 def _edges(

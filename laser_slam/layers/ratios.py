@@ -63,23 +63,19 @@ def measure_ratios(pairs: Pairs, estimator: str) -> Ratios:
     """
     support = np.bincount(pairs.group, minlength=pairs.num_groups)
     log_ratio = np.log(pairs.target) - np.log(pairs.source)
-    quartiles = [
-        _weighted_quantile(pairs, log_ratio, pairs.weight, share) for share in (0.25, 0.75)
-    ]
     scale = RATIO_ESTIMATORS[estimator](pairs, log_ratio)
-    return Ratios(
-        np.where(support > 0, scale, np.nan), (quartiles[1] - quartiles[0]) / 1.349, support
-    )
+    spread = _quartile_distance(pairs, log_ratio) / 1.349
+    return Ratios(np.where(support > 0, scale, np.nan), spread, support)
 
 
 def _median(pairs: Pairs, log_ratio: Float) -> Array:
     """Median of the log-ratios: no unit, no leverage of far pixels."""
-    return _weighted_quantile(pairs, log_ratio, pairs.weight, 0.5)
+    return _median_of(pairs, log_ratio, pairs.weight)
 
 
 def _l1(pairs: Pairs, log_ratio: Float) -> Array:
     """Minimum of the sum of ``|s * source - target|``, which is a weighted median of the ratios."""
-    return _weighted_quantile(pairs, log_ratio, pairs.weight * pairs.source, 0.5)
+    return _median_of(pairs, log_ratio, pairs.weight * pairs.source)
 
 
 def _huber(pairs: Pairs, log_ratio: Float) -> Array:
@@ -120,24 +116,49 @@ def _sums(pairs: Pairs, values: NDArray[Any]) -> Array:
     return np.asarray(np.bincount(pairs.group, values, minlength=pairs.num_groups), np.float64)
 
 
-def _weighted_quantile(pairs: Pairs, values: Float, weight: Float, share: float) -> Array:
-    """Return (G,) weighted quantiles of each group: a histogram, then one of its decisive bin."""
-    low = np.full(pairs.num_groups, -_REACH)
+def _median_of(pairs: Pairs, values: Float, weight: Float) -> Array:
+    """Return (G,) weighted medians: a histogram of each group, then one of its decisive bin."""
     width = 2 * _REACH / _BINS
-    below = np.zeros(pairs.num_groups)
-    inside = np.ones(len(values), dtype=bool)
-    total = _sums(pairs, weight)
-    for last in (False, True):
-        position = (values - low[pairs.group]) / width
-        if not last:
-            position = position.clip(0, _BINS - 1e-3)
-        else:
-            inside = (position >= 0) & (position < _BINS)
-        cell = pairs.group[inside] * _BINS + position[inside].astype(np.int64)
-        counts = np.bincount(cell, weight[inside], minlength=pairs.num_groups * _BINS)
-        mass = below[:, None] + counts.reshape(-1, _BINS).cumsum(axis=1)
-        decisive = (mass < share * total[:, None]).sum(axis=1).clip(0, _BINS - 1)
-        before = np.where(decisive > 0, mass[np.arange(len(mass)), decisive - 1], below)
-        low, below = low + decisive * width, before
-        width /= _BINS
-    return np.asarray(low + 0.5 * width * _BINS)
+    decisive, before, _ = _decisive_bins(pairs, values, weight, 0.5)
+    low = decisive * width - _REACH
+    fine = (values - low[pairs.group]) * (_BINS / width)
+    inside = (fine >= 0) & (fine < _BINS)
+    counts = _histogram(pairs, fine[inside], inside, weight)
+    mass = before[:, None] + counts.cumsum(axis=1)
+    half = 0.5 * _sums(pairs, weight)
+    return np.asarray(low + (_rank(mass, half) + 0.5) * width / _BINS)
+
+
+def _quartile_distance(pairs: Pairs, values: Float) -> Array:
+    """Return (G,) distance of the weighted quartiles, linear inside the bins of a histogram."""
+    first, third = (
+        decisive + fraction
+        for share in (0.25, 0.75)
+        for decisive, _, fraction in [_decisive_bins(pairs, values, pairs.weight, share)]
+    )
+    return np.asarray((third - first) * 2 * _REACH / _BINS)
+
+
+def _decisive_bins(
+    pairs: Pairs, values: Float, weight: Float, share: float
+) -> tuple[Array, Array, Array]:
+    """Return (G,) the bin that holds a quantile, the weight before it, and how far in it lies."""
+    position = ((values + _REACH) * (_BINS / (2 * _REACH))).clip(0, _BINS - 1)
+    mass = _histogram(pairs, position, np.ones(len(values), dtype=bool), weight).cumsum(axis=1)
+    wanted = share * mass[:, -1]
+    decisive = _rank(mass, wanted)
+    row = np.arange(len(mass))
+    before = np.where(decisive > 0, mass[row, decisive - 1], 0.0)
+    inside = np.maximum(mass[row, decisive] - before, 1e-30)
+    return decisive.astype(np.float64), before, ((wanted - before) / inside).clip(0, 1)
+
+
+def _histogram(pairs: Pairs, position: NDArray[Any], used: NDArray[np.bool_], weight: Float) -> Array:
+    cell = pairs.group[used] * _BINS + position.astype(np.int64)
+    counts = np.bincount(cell, weight[used], minlength=pairs.num_groups * _BINS)
+    return np.asarray(counts.reshape(-1, _BINS), np.float64)
+
+
+def _rank(mass: Array, wanted: Array) -> Indices:
+    """Return (G,) the first bin where (G, B) rising ``mass`` reaches ``wanted``."""
+    return np.asarray((mass < wanted[:, None]).sum(axis=1).clip(0, mass.shape[1] - 1), np.int64)

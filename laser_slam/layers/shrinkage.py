@@ -20,8 +20,10 @@ Indices = NDArray[np.int64]
 _LENGTH = 1.0  # log depth over which the curve forgets itself
 _MIN_SIGMA = 1e-3  # log-ratio below which nothing is worth a correction
 _NOISE_SUPPORT = 60.0  # cells with which a layer's own noise counts as much as what all share
-_STRENGTHS = (0.0, 0.2, 0.5, 1.0)  # of curve and layers, in spreads of the ratios
+_STRENGTHS = (0.0, 0.3, 0.7, 1.2)  # of curve and layers, in spreads of the ratios
 _MAX_OBSERVATIONS = 240
+_NEIGHBOURHOOD = 0.15  # image widths over which neighbours cease to be parts of one thing
+_SURFACE = 0.6  # of log depth, the same
 
 
 @dataclass(frozen=True)
@@ -33,12 +35,14 @@ class Observations:
         variance: (G,) noise of it.
         track: (G,) which track of layers; from 0.
         log_depth: (G,) in window units.
+        place: (G, 2) centre in the image, in image widths.
     """
 
     log_ratio: Array
     variance: Array
     track: Indices
     log_depth: Array
+    place: Array
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,9 @@ class Distortion:
     strengths: tuple[float, float]
 
 
+NO_DISTORTION = Distortion(np.empty(0), np.empty(0), np.empty(0), (0.0, 0.0))
+
+
 def explain(observed: Observations, num_tracks: int, *, with_curve: bool) -> Distortion:
     """Split the observations into curve, tracks' own parts and noise by their evidence.
 
@@ -73,8 +80,11 @@ def explain(observed: Observations, num_tracks: int, *, with_curve: bool) -> Dis
     if len(observed.log_ratio) < 2:
         return nothing
     spread = float(np.sqrt(np.mean(observed.log_ratio**2)))
-    near = np.exp(-np.abs(observed.log_depth[:, None] - observed.log_depth) / _LENGTH)
-    same = (observed.track[:, None] == observed.track).astype(float)
+    step = np.abs(observed.log_depth[:, None] - observed.log_depth)
+    near = np.exp(-step / _LENGTH)
+    apart = np.abs(observed.place[:, None] - observed.place).sum(axis=2)
+    same = 0.5 * (observed.track[:, None] == observed.track)
+    same += 0.5 * np.exp(-apart / _NEIGHBOURHOOD - step / _SURFACE)
     noise = np.diag(observed.variance)
     best, chosen = -np.inf, (0.0, 0.0)
     for curve in _STRENGTHS if with_curve else (0.0,):
@@ -87,7 +97,8 @@ def explain(observed: Observations, num_tracks: int, *, with_curve: bool) -> Dis
         return nothing
     covariance = chosen[0] ** 2 * near + chosen[1] ** 2 * same + noise
     pull = cho_solve(cho_factor(covariance), observed.log_ratio)
-    of_track = chosen[1] ** 2 * np.bincount(observed.track, pull, minlength=num_tracks)
+    own = chosen[1] ** 2 * same @ pull
+    of_track = _means(own, observed, num_tracks)
     knots = _knots(observed.log_depth) if chosen[0] else np.empty(0)
     curve_there = chosen[0] ** 2 * np.exp(-np.abs(knots[:, None] - observed.log_depth) / _LENGTH)
     return Distortion(knots, curve_there @ pull, np.asarray(of_track), chosen)
@@ -101,7 +112,16 @@ def _strongest(observed: Observations) -> Observations:
         observed.variance[kept],
         observed.track[kept],
         observed.log_depth[kept],
+        observed.place[kept],
     )
+
+
+def _means(values: Array, observed: Observations, num_tracks: int) -> Array:
+    """Average (G,) values over each track, by their certainty; 0 for tracks without any."""
+    certainty = 1 / observed.variance
+    sums = np.bincount(observed.track, certainty * values, minlength=num_tracks)
+    weights = np.bincount(observed.track, certainty, minlength=num_tracks)
+    return np.asarray(sums / np.maximum(weights, 1e-30))
 
 
 def _evidence(covariance: Array, values: Array) -> float:

@@ -4,6 +4,7 @@ from laser_slam.store.files import atomic_write, write_text
 from laser_slam.store.run import link_latest, new_run_folder, open_run_folder
 from laser_slam.store.windows import (
     FORMAT_VERSION,
+    WindowFiles,
     load_layers,
     load_prediction,
     save_layers,
@@ -12,6 +13,7 @@ from laser_slam.store.windows import (
 
 __all__ = [
     "FORMAT_VERSION",
+    "WindowFiles",
     "atomic_write",
     "link_latest",
     "load_layers",

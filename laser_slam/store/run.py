@@ -56,7 +56,8 @@ def open_run_folder(folder: Path, config: Config, sequence: Mapping[str, Any]) -
         _refuse_difference(folder / "sequence.yaml", dict(sequence), "input")
     try:
         (folder / "windows").mkdir(parents=True, exist_ok=True)
-        (folder / "pictures").mkdir(exist_ok=True)
+        for inner in ("layers", "pictures"):
+            (folder / inner).mkdir(exist_ok=True)
         for partial in folder.rglob(".*.partial*"):  # of a run that was killed
             partial.unlink()
     except OSError as error:
@@ -89,7 +90,7 @@ def _is_broken_off_run(folder: Path) -> bool:
     return is_run
 
 
-_OF_AN_EARLY_END = {"sequence.yaml", "windows", "pictures", "run.log"}
+_OF_AN_EARLY_END = {"sequence.yaml", "windows", "layers", "pictures", "run.log"}
 
 
 def _refuse_difference(path: Path, wanted: dict[str, Any], what: str) -> None:

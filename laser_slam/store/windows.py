@@ -94,6 +94,55 @@ def load_layers(path: Path) -> Layers:
         return Layers(**{field.name: arrays[field.name] for field in fields(Layers)})
 
 
+class WindowFiles:
+    """The files of all windows of a run, by the windows' indices.
+
+    Args:
+        folder: of the run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def has(self, index: int) -> bool:
+        """Tell whether a window was predicted before."""
+        return self._path("windows", index).exists()
+
+    def save(self, index: int, prediction: Prediction, colors: Image) -> Prediction:
+        """Write a window; see ``save_prediction``."""
+        return save_prediction(self._path("windows", index), prediction, colors)
+
+    def load(self, index: int, frames: NDArray[np.int64] | None = None) -> tuple[Prediction, Image]:
+        """Read a window back; see ``load_prediction``.
+
+        Args:
+            index: of the window.
+            frames: (N,) that it must hold; None: whatever it holds.
+
+        Raises:
+            RunFolderError: also when it holds other frames.
+        """
+        path = self._path("windows", index)
+        prediction, colors = load_prediction(path)
+        if frames is not None and not np.array_equal(prediction.frames, frames):
+            raise RunFolderError(
+                f"{path} holds other frames than window {index} of this input; "
+                "choose another folder with --out"
+            )
+        return prediction, colors
+
+    def save_layers(self, index: int, layers: Layers) -> None:
+        """Write a window's layers; see ``save_layers``."""
+        save_layers(self._path("layers", index), layers)
+
+    def load_layers(self, index: int) -> Layers:
+        """Read a window's layers back; see ``load_layers``."""
+        return load_layers(self._path("layers", index))
+
+    def _path(self, kind: str, index: int) -> Path:
+        return self._folder / kind / f"{index:06d}.npz"
+
+
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
     """Say of what is wrong with a file that it is this file, and what to do."""
