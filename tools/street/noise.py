@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_LARGEST_OUTLIER = np.log(2.9)  # outliers are wrong by up to this factor, either way
+_LARGEST_OUTLIER = np.log(2.8)  # outliers are wrong by up to this factor, either way
 _EDGE_JUMP = 0.05  # depth step that makes an edge, in its depth
 _NOISE_CELLS = 3  # of smooth noise from top to bottom
 _NOISE_MEMORY = 0.85  # correlation of smooth noise between neighbouring frames
@@ -76,7 +76,7 @@ def confidence(
         is_sky: (N, H, W) where there is none.
         rng: of its own noise.
     """
-    out = 0.95 / (1 + (truth / 60.0) ** 2) * np.where(is_edge, 0.4, 1.0)
-    out += 0.03 * rng.normal(size=truth.shape)
+    out = 0.9 / (1 + (truth / 70.0) ** 4) * np.where(is_edge, 0.4, 1.0)
+    out += 0.05 * rng.normal(size=truth.shape)
     out[is_sky] = 0.02
     return np.asarray(np.clip(out, 0.01, 1.0))
