@@ -1,9 +1,10 @@
-"""A drive in laps around a block, measured with known noise: the pose graph's test bed."""
+"""A drive in laps around a block, measured with known noise: what the pose graph is tried on."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,16 +26,30 @@ class Drive:
     """What is true and what was measured.
 
     Attributes:
-        graph: windows at their chained places, registrations and closures.
         truth: ``world_from_window``.
         chained: ``world_from_window`` from the registrations alone.
+        registrations: from the second window on, each to the one before.
+        closures: windows a and b, ``a_from_b`` and its sigmas.
         is_right: (C,) the closures that tell the truth.
     """
 
-    graph: PoseGraph
     truth: list[Sim3]
     chained: list[Sim3]
+    registrations: list[Registration]
+    closures: list[tuple[int, int, Sim3, Array]]
     is_right: NDArray[np.bool_]
+
+    def graph(self, *, right_only: bool = False, start: Sequence[Sim3] | None = None) -> PoseGraph:
+        """Put all in a new graph, windows at their chained places or at others."""
+        graph = PoseGraph(PoseGraphConfig())
+        for index, place in enumerate(start or self.chained):
+            graph.add_window(index, place)
+        for index, registration in enumerate(self.registrations, start=1):
+            graph.add_registration(index - 1, index, registration)
+        for closure, is_right in zip(self.closures, self.is_right, strict=True):
+            if is_right or not right_only:
+                graph.add_closure(*closure)
+        return graph
 
 
 @dataclass(frozen=True)
@@ -58,7 +73,7 @@ class Plan:
 
 def sigmas_in(window: Sim3) -> Array:
     """Return the sigmas of a link whose previous window is given: the world's step is 10."""
-    return SIGMAS / np.repeat([1.0, window.scale, 1.0], [3, 3, 1])
+    return np.asarray(SIGMAS / np.repeat([1.0, window.scale, 1.0], [3, 3, 1]))
 
 
 def disturb(a_from_b: Sim3, sigmas: Array, rng: np.random.Generator) -> Sim3:
@@ -87,25 +102,24 @@ def laps(plan: Plan, rng: np.random.Generator) -> list[Sim3]:
 
 
 def measure(plan: Plan, seed: int) -> Drive:
-    """Measure a drive and put it in a graph."""
+    """Measure a drive."""
     rng = np.random.default_rng(seed)
     truth = laps(plan, rng)
-    graph = PoseGraph(PoseGraphConfig())
-    chained = truth[:1]
-    graph.add_window(0, truth[0])
-    for row in range(1, plan.num):
-        sigmas = sigmas_in(truth[row - 1])
-        found = disturb(truth[row - 1].inverse() @ truth[row], sigmas, rng)
+    chained, registrations = truth[:1], []
+    for previous, current in pairwise(truth):
+        sigmas = sigmas_in(previous)
+        found = disturb(previous.inverse() @ current, sigmas, rng)
         found = Sim3(found.scale * np.exp(plan.growth), found.rotation, found.translation)
         chained.append(chained[-1] @ found)
-        graph.add_window(row, chained[-1])
-        graph.add_registration(row - 1, row, Registration(found, sigmas, 1000, 0.01))
+        registrations.append(Registration(found, sigmas, 1000, 0.01))
     is_right = rng.permutation(np.arange(plan.closures) >= plan.wrong)
+    closures = []
     for right in is_right:
         a, b = revisit(plan, rng) if right else elsewhere(plan, rng)
+        sigmas = sigmas_in(truth[a])
         a_from_b = truth[a].inverse() @ truth[b] if right else Sim3()
-        graph.add_closure(a, b, disturb(a_from_b, sigmas_in(truth[a]), rng), sigmas_in(truth[a]))
-    return Drive(graph, truth, chained, is_right)
+        closures.append((a, b, disturb(a_from_b, sigmas, rng), sigmas))
+    return Drive(truth, chained, registrations, closures, is_right)
 
 
 def revisit(plan: Plan, rng: np.random.Generator) -> tuple[int, int]:
