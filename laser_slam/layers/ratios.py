@@ -120,12 +120,13 @@ def _median_of(pairs: Pairs, values: Float, weight: Float) -> Array:
     """Return (G,) weighted medians: a histogram of each group, then one of its decisive bin."""
     width = 2 * _REACH / _BINS
     decisive, before, _ = _decisive_bins(pairs, values, weight, 0.5)
-    low = decisive * width - _REACH
-    fine = (values - low[pairs.group]) * (_BINS / width)
+    # The same rounding as in the first round: no value may fall between two bins.
+    fine = (_positions(values) - decisive.astype(np.float32)[pairs.group]) * _BINS
     inside = (fine >= 0) & (fine < _BINS)
     counts = _histogram(pairs, fine[inside], inside, weight)
     mass = before[:, None] + counts.cumsum(axis=1)
     half = 0.5 * _sums(pairs, weight)
+    low = decisive * width - _REACH
     return np.asarray(low + (_rank(mass, half) + 0.5) * width / _BINS)
 
 
@@ -143,7 +144,7 @@ def _decisive_bins(
     pairs: Pairs, values: Float, weight: Float, share: float
 ) -> tuple[Array, Array, Array]:
     """Return (G,) the bin that holds a quantile, the weight before it, and how far in it lies."""
-    position = ((values + _REACH) * (_BINS / (2 * _REACH))).clip(0, _BINS - 1)
+    position = _positions(values)
     mass = _histogram(pairs, position, np.ones(len(values), dtype=bool), weight).cumsum(axis=1)
     wanted = share * mass[:, -1]
     decisive = _rank(mass, wanted)
@@ -153,7 +154,15 @@ def _decisive_bins(
     return decisive.astype(np.float64), before, ((wanted - before) / inside).clip(0, 1)
 
 
-def _histogram(pairs: Pairs, position: NDArray[Any], used: NDArray[np.bool_], weight: Float) -> Array:
+def _positions(values: Float) -> Float:
+    """Return (P,) bin and place in it of each value; what is out of reach is at the end."""
+    position = (values + _REACH) * (_BINS / (2 * _REACH))
+    return np.asarray(position.clip(0, _BINS - 1e-3), np.float32)
+
+
+def _histogram(
+    pairs: Pairs, position: NDArray[Any], used: NDArray[np.bool_], weight: Float
+) -> Array:
     cell = pairs.group[used] * _BINS + position.astype(np.int64)
     counts = np.bincount(cell, weight[used], minlength=pairs.num_groups * _BINS)
     return np.asarray(counts.reshape(-1, _BINS), np.float64)
