@@ -80,7 +80,7 @@ def test_the_covariance_of_a_link_is_the_derivative_of_its_errors(seed: int) -> 
             self.axis = axis
 
         def normal(self, size: int) -> Array:
-            return np.eye(size)[self.axis]
+            return np.asarray(np.eye(size)[self.axis])
 
     moved = [disturb(true, small * sigmas, OneByOne(axis)) for axis in range(7)]  # type: ignore[arg-type]
     slopes = local_errors(true, moved) / small
@@ -165,7 +165,7 @@ def test_the_start_may_lie_far_from_the_solution() -> None:
 @pytest.mark.parametrize("growth", [0.0, 0.004])
 def test_wrong_closures_do_not_bend_the_map(share: float, growth: float) -> None:
     for seed in range(2):
-        plan = Plan(closures=20, wrong=int(20 * share), growth=growth)
+        plan = Plan(num=120, lap=40, closures=20, wrong=int(20 * share), growth=growth)
         drive = measure(plan, seed)
         result = drive.graph().optimise()
         assert not (result.is_trusted & ~drive.is_right).any()

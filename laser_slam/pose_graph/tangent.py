@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from laser_slam.dependencies import import_gtsam
 from laser_slam.errors import DegenerateGeometryError
-from laser_slam.sim3 import Sim3, orthonormal
+from laser_slam.sim3 import Sim3
 
 Array = NDArray[np.float64]
 
@@ -32,8 +32,7 @@ def to_gtsam(b_from_a: Sim3) -> Any:
 def from_gtsam(b_from_a: Any) -> Sim3:
     """Return the Sim3 that moves points as a ``gtsam.Similarity3`` does."""
     scale = b_from_a.scale()
-    rotation = orthonormal(b_from_a.rotation().matrix())
-    return Sim3(scale, rotation, scale * b_from_a.translation())
+    return Sim3(scale, b_from_a.rotation().matrix(), scale * b_from_a.translation())
 
 
 def local_covariance(a_from_b: Sim3, sigmas: Array) -> Array:
