@@ -126,6 +126,8 @@ class Pipeline:
                 prediction, colors = self._predict(window)
                 self._place(prediction, colors)
             (self.folder / COMPLETE).touch()
+            with self._clock.stage("layers"):
+                self._slam.smooth_layers(self._files)
             trajectory = self._trajectory()
             cloud = self._fuse()
             with self._clock.stage("evaluate"):

@@ -19,9 +19,11 @@ from laser_slam.layers import (
     apply_layers,
     first_layers,
     make_segmenter,
+    smooth_layers,
 )
 from laser_slam.registration import bridge, register
 from laser_slam.sim3 import Sim3, complete_poses
+from laser_slam.store import WindowFiles
 from laser_slam.types import (
     Image,
     Layers,
@@ -69,6 +71,14 @@ class Node:
     def is_owned(self) -> NDArray[np.bool_]:
         """Return (N,) True where this window gives the frame to trajectory and map."""
         return (self.frames >= self.owned[0]) & (self.frames < self.owned[1])
+
+    @property
+    def measured_scale(self) -> float | None:
+        """Return the scale that maps this window's unit to the last one's; None: unmeasured."""
+        registration = self.registration
+        if registration is None or registration.bridged:
+            return None
+        return registration.previous_from_current.scale
 
     def submap(self, prediction: Prediction, colors: Image) -> Submap:
         """Join the node with its window's prediction, layers applied, from disk perhaps."""
@@ -147,6 +157,23 @@ class Slam:
             return prediction
         return apply_layers(prediction, self.layers, self._config.layers)
 
+    def smooth_layers(self, files: WindowFiles) -> None:
+        """Let the layers of early windows learn from later ones, once all windows are stored.
+
+        Args:
+            files: of the run; those of the layers are written anew.
+        """
+        if not self._config.smooths_layers:
+            return
+        backwards = self.nodes[::-1]
+        windows = (
+            (files.load_depth(node.index), files.load_layers(node.index), node.measured_scale)
+            for node in backwards
+        )
+        smoothed = smooth_layers(windows, self._config.layers)
+        for node, layers in zip(backwards, smoothed, strict=True):
+            files.save_layers(node.index, layers)
+
     @property
     def bridged(self) -> dict[int, str]:
         """Name the windows whose place is a guess, and why."""
@@ -179,13 +206,12 @@ class Slam:
         if self._segmenter is None:
             return
         labels = self._segmenter.segment(placed, colors)
-        registration = self.nodes[-1].registration
+        scale = self.nodes[-1].measured_scale
         previous = None if self._last is None or self.layers is None else (self._last, self.layers)
-        if previous is None or registration is None or registration.bridged:
+        if previous is None or scale is None:
             self.layers = first_layers(labels)  # there is no scale that layers could differ from
             counts = LayerCounts(len(self.layers.scales))
         else:
-            scale = registration.previous_from_current.scale
             self.layers, counts = align_layers(previous, placed, labels, scale, self._config.layers)
         self.nodes[-1] = replace(self.nodes[-1], layers=counts)
 

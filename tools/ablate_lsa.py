@@ -12,7 +12,7 @@ the ratios); poses after one Sim(3).
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
@@ -32,11 +32,11 @@ from laser_slam.datasets.base import Dataset
 from laser_slam.errors import LaserSlamError
 from laser_slam.evaluation.depth import evaluate_depth
 from laser_slam.evaluation.trajectory import evaluate_trajectory
-from laser_slam.layers import apply_layers
+from laser_slam.layers import apply_layers, smooth_layers
 from laser_slam.rectification import Rectifier
 from laser_slam.slam import Slam
 from laser_slam.store import WindowFiles
-from laser_slam.types import NO_DISTORTION, Calibration, Layers, Window
+from laser_slam.types import NO_DISTORTION, Calibration, Layers, Prediction, Window
 from laser_slam.windows import cut_windows, select_keyframes
 
 Depth = NDArray[np.float32]
@@ -65,6 +65,7 @@ ROWS = {
     "w/o Anchor": Row(None, (ON, "registration.rigid=points")),
     "w/o curve": Row(None, (ON, "layers.curve=false")),
     "w/o shrinking": Row(None, (ON, "layers.shrink=false")),
+    "w/o second pass": Row(None, (ON, "layers.smooth=false")),
     "w/o memory": Row(None, (ON, "layers.memory=0")),
     "w/o feathering": Row(None, (ON, "layers.feather=0")),
     "full resolution": Row(None, (ON, "layers.segmentation.downscale=1")),
@@ -121,7 +122,7 @@ class Predictions:
             self.num += 1
 
 
-def main(
+def main(  # noqa: PLR0913, PLR0917  (one for each flag)
     data: Annotated[str, typer.Argument(help="demo, kitti or 7scenes")],
     folder: Annotated[Path | None, typer.Argument(help="where the data lies")] = None,
     sequence: Annotated[str, typer.Option(help="of KITTI")] = "00",
@@ -175,10 +176,13 @@ def _open(data: str, folder: Path | None, sequence: str, assignments: list[str])
 def _evaluate(
     predictions: Predictions, dataset: Dataset, config: Config, min_confidence: float
 ) -> Result:
-    slam, layers = Slam(config), list[Layers | None]()
+    slam = Slam(config)
+    layers: list[Layers | None] = []
     for index in range(predictions.num):
         slam.add(*predictions.files.load(index))
         layers.append(slam.layers)
+    if config.smooths_layers:
+        layers = _smoothed(predictions, slam, layers, config)
     errors = None
     if dataset.info.truth is not None:
         times_s = np.arange(100_000) / 10.0
@@ -208,6 +212,18 @@ def _evaluate(
         None if errors is None else errors.ate_sim3_m.rmse if errors.ate_sim3_m else None,
         sum(c.reached for c in counts) / total if total else None,
     )
+
+
+def _smoothed(
+    predictions: Predictions, slam: Slam, layers: Sequence[Layers | None], config: Config
+) -> list[Layers | None]:
+    def backwards() -> Iterator[tuple[Prediction, Layers, float | None]]:
+        for node, its_layers in zip(reversed(slam.nodes), reversed(layers), strict=True):
+            assert its_layers is not None
+            yield predictions.files.load(node.index)[0], its_layers, node.measured_scale
+
+    smoothed: list[Layers | None] = list(smooth_layers(backwards(), config.layers))
+    return smoothed[::-1]
 
 
 def _nearest(image: Depth, size: tuple[int, ...]) -> Depth:

@@ -107,7 +107,7 @@ class SegmentationConfig(_Section):
     scale: float = Field(
         30.0, gt=0, description="255 k of Felzenszwalb's threshold k / size: larger, fewer layers"
     )
-    sigma: float = Field(0.6, ge=0, le=10, description="blur before, in cells of the label map")
+    sigma: float = Field(1.2, ge=0, le=20, description="blur before, in px of the depth map")
     min_share: float = Field(
         0.002, ge=0, le=1, description="smaller layers join a neighbour, share of the image's area"
     )
@@ -160,6 +160,9 @@ class LayersConfig(_Section):
     curve: bool = Field(True, description="with shrink: scales may follow a curve over log depth")
     memory: int = Field(
         20, ge=0, description="windows whose opinions a scale averages; 0: the one before is right"
+    )
+    smooth: bool = Field(
+        True, description="with memory: a second pass, backwards, for what later windows say"
     )
     min_support: float = Field(
         3e-4, ge=0, le=1, description="share of the image that a measured scale needs"
@@ -253,3 +256,8 @@ class Config(_Section):
         if self.layers.enabled == "auto":
             return self.backbone.name != "classical"
         return self.layers.enabled == "always"
+
+    @property
+    def smooths_layers(self) -> bool:
+        """Tell whether layers are passed over a second time, backwards."""
+        return self.has_layers and self.layers.smooth and self.layers.memory > 0

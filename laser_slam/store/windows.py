@@ -131,6 +131,12 @@ class WindowFiles:
             )
         return prediction, colors
 
+    def load_depth(self, index: int) -> Prediction:
+        """Read a window back without its colours; see ``load_prediction``."""
+        path = self._path("windows", index)
+        with _reading(path):
+            return _unpack(_arrays_of(path))
+
     def save_layers(self, index: int, layers: Layers) -> None:
         """Write a window's layers; see ``save_layers``."""
         save_layers(self._path("layers", index), layers)
