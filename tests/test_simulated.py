@@ -1,5 +1,6 @@
 """The simulated backbone: each error has the size that its setting says, and nothing else has."""
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,13 +15,14 @@ from laser_slam.backbones import make_backbone
 from laser_slam.backbones.simulated import SimulatedBackbone
 from laser_slam.backbones.simulated.backbone import SIMULATED
 from laser_slam.backbones.simulated.fields import add_blobs, smooth_maps
+from laser_slam.backbones.simulated.gravity import guess_down, settle_down
 from laser_slam.backbones.simulated.piece_kernels import GROUND_TAG
 from laser_slam.camera import resize_intrinsics
 from laser_slam.config import load_config
 from laser_slam.datasets.base import Dataset
 from laser_slam.errors import ConfigError
 from laser_slam.pipeline import Pipeline
-from laser_slam.sim3 import Sim3, rotation_log
+from laser_slam.sim3 import Sim3, rotation_exp, rotation_log
 from laser_slam.types import Prediction, SequenceInfo, Trajectory, WindowStatus
 
 Map = NDArray[np.float32]
@@ -254,6 +256,21 @@ def test_pieces_are_like_objects_and_the_ground_is_in_few(street: Dataset) -> No
     assert is_ground[upright].mean() < 0.05
     assert len(np.unique(keys[is_ground])) <= 6
     assert 20 < len(np.unique(keys[(keys > 0) & ~is_ground])) < 300
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_down_is_found_though_the_camera_is_held_askew(
+    short_drive: RenderedDrive, axis: int
+) -> None:
+    tilt = rotation_exp(np.radians(20) * np.eye(3)[axis])
+    poses, depths = short_drive.world_from_cam[::6], list(short_drive.depths[::6])
+    true_down = guess_down(poses)  # the cameras on a car are level
+    askew = tilt @ true_down
+    found = settle_down(askew, depths, short_drive.intrinsics, poses)
+    assert np.degrees(np.arccos(min(1.0, float(found @ true_down)))) < 4.0
+    blank = [np.full_like(depths[0], np.nan)]
+    unmoved = settle_down(askew, blank, short_drive.intrinsics, poses[:1])
+    np.testing.assert_array_equal(unmoved, askew)
 
 
 def test_objects_have_factors_of_their_size(street: Dataset) -> None:
@@ -517,6 +534,15 @@ def test_a_window_without_any_true_depth_fails_with_a_reason() -> None:
     assert prediction.status is WindowStatus.FAILED
     assert np.isnan(prediction.depth).all()
     assert "3 frames have no true depth: left unknown" in prediction.warnings
+
+
+def test_hundreds_of_frames_a_second_are_within_reach(street: Dataset) -> None:
+    """At 518 wide, in CPU time: 10 ms a frame are 200 frames/s on two cores, here with room."""
+    made = backbone(street, **{**DEFAULTS, "width": 518})
+    predict(made, 0, 20)
+    start = time.process_time()
+    predict(made, 0, 20)
+    assert (time.process_time() - start) / 20 < 0.02
 
 
 # --- refusals, and a whole run ------------------------------------------------------------------

@@ -26,13 +26,15 @@ class SimulatedConfig(Section):
     layers: Literal["bands", "objects"] = Field(
         "objects", description="what has a factor of its own: a band of log depth, or a world piece"
     )
-    layer_sigma: float = Field(0.1, ge=0, le=1, description="factor of each layer, per window, log")
+    layer_sigma: float = Field(
+        0.08, ge=0, le=1, description="factor of each layer, per window, log"
+    )
     layer_law: Literal["uniform", "normal"] = Field(
         "uniform", description="law of the logarithm of the layers' factors"
     )
     band_width: float = Field(0.4, gt=0, description="width of 'bands' in log depth")
     object_size: float = Field(
-        0.5, gt=0, description="width of 'objects', in median depths of the first frame"
+        0.5, gt=0, description="width of 'objects', in median depths of the sequence"
     )
     persistence: float = Field(
         0.5, ge=0, le=1, description="share of the depth errors' variance that all windows share"
@@ -51,14 +53,14 @@ class SimulatedConfig(Section):
         0.8, ge=0, le=1, description="how well confidence knows of edges, distance and noise"
     )
     pose_rotation_deg: float = Field(
-        0.05, ge=0, le=30, description="rotation noise of each frame, rms, degrees"
+        0.1, ge=0, le=30, description="rotation noise of each frame, rms, degrees"
     )
     pose_translation: float = Field(
-        0.002, ge=0, le=1, description="position noise of each frame, rms, in median depths"
+        0.003, ge=0, le=1, description="position noise of each frame, rms, in median depths"
     )
     drift_rotation_deg: float = Field(
-        0.01, ge=0, le=10, description="turn from frame to frame, one for a window, rms, degrees"
+        0.05, ge=0, le=10, description="turn from frame to frame, one for a window, rms, degrees"
     )
     drift_translation: float = Field(
-        0.005, ge=0, le=1, description="slip from frame to frame, one for a window, rms, of a step"
+        0.02, ge=0, le=1, description="slip from frame to frame, one for a window, rms, of a step"
     )

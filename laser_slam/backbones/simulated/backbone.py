@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from laser_slam.backbones.simulated.distortion import Distortion
 from laser_slam.backbones.simulated.draws import Draws, Purpose
-from laser_slam.backbones.simulated.pieces import Pieces, level_from_world
+from laser_slam.backbones.simulated.gravity import guess_down, level_axes, settle_down
+from laser_slam.backbones.simulated.pieces import Pieces
 from laser_slam.backbones.simulated.poses import distort_poses
 from laser_slam.backbones.simulated.truth import STRIDE, TrueDepth, Truth, WindowTruth
 from laser_slam.config import BackboneConfig
@@ -69,10 +70,12 @@ class SimulatedBackbone:
         self._workers = ThreadPoolExecutor(os.cpu_count() or 1)
         self._has_warned = False
         partition = Draws(self._config.seed, 0, 1.0).common(Purpose.PARTITION)
+        samples, K = self._truth.samples, self._truth.intrinsics
+        upright = guess_down(self._truth.trajectory.world_from_cam)
         self._pieces = Pieces(
             self._config.object_size,
-            self._truth.median_m,
-            level_from_world(self._truth.world_from_cam),
+            samples.median_m,
+            level_axes(settle_down(upright, samples.depths, K, samples.world_from_cam)),
             np.uint64(partition.integers(1 << 62)),
         )
 

@@ -46,6 +46,31 @@ class NoiseLaw(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
+def weave(down: Map, grids: Map, across: Map, out: Map) -> None:
+    """Make smooth maps of knots; BLAS would do it on threads of its own, under those of frames.
+
+    Args:
+        down: (H, R) weights of the rows of knots.
+        grids: (K, R, C) knots.
+        across: (C, W) weights of the columns of knots.
+        out: (K, H, W) is filled.
+    """
+    row = np.empty(grids.shape[2], np.float32)
+    for k in range(len(grids)):
+        for y in range(len(down)):
+            row[:] = 0
+            for r in range(grids.shape[1]):
+                for c in range(grids.shape[2]):
+                    row[c] += down[y, r] * grids[k, r, c]
+            for x in range(across.shape[1]):
+                out[k, y, x] = 0
+            for c in range(grids.shape[2]):
+                weight = row[c]
+                for x in range(across.shape[1]):
+                    out[k, y, x] += weight * across[c, x]
+
+
+@njit(cache=True, nogil=True)
 def layer_log_factor(key: np.uint64, law: LayerLaw) -> float:
     """Return the logarithm of a layer's factor."""
     common, own = mix(key, law.common_seed), mix(key, law.own_seed)

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from laser_slam.backbones.simulated.depth_kernels import weave
+
 Map = NDArray[np.float32]
 
 BLOB_RADIUS = (0.02, 0.07)  # of the image's width
@@ -27,7 +29,6 @@ def spline_basis(num_knots: int, num: int) -> Map:
     spline = CubicSpline(np.arange(num_knots), np.eye(num_knots), bc_type="natural")
     basis = spline(np.linspace(0, num_knots - 1, num))
     basis /= np.linalg.norm(basis, axis=1, keepdims=True)
-    basis.setflags(write=False)
     return np.asarray(basis, np.float32)
 
 
@@ -39,8 +40,10 @@ def num_knots(length: int, spacing: float) -> int:
 def smooth_maps(grids: Map, size: tuple[int, int]) -> Map:
     """Make (K, H, W) smooth maps of (K, rows, columns) knots."""
     down = spline_basis(grids.shape[1], size[0])
-    across = spline_basis(grids.shape[2], size[1])
-    return np.asarray(down @ grids @ across.T)
+    across = np.ascontiguousarray(spline_basis(grids.shape[2], size[1]).T)
+    out = np.empty((len(grids), *size), np.float32)
+    weave(down, grids, across, out)
+    return out
 
 
 def add_blobs(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from laser_slam.backbones.simulated.gravity import coarse_points
 from laser_slam.backbones.simulated.piece_kernels import Ground, no_seeds, object_keys
-from laser_slam.camera import unproject
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -19,8 +19,6 @@ MIN_SHARE = 0.5  # of a column's points that its lowest slab holds where it is g
 MIN_POINTS = 4
 MAX_COLUMNS = 512
 LOWEST = 0.05  # share of the points that may lie below the ground: wrong ones
-STRIDE = 8  # of the pixels that show where ground is
-UPRIGHT_WEIGHT = 0.05  # of the mean upright, against cameras that do not roll
 
 
 @dataclass(frozen=True)
@@ -47,12 +45,8 @@ class Pieces:
             intrinsics: (3, 3) in pixels of the maps.
             world_from_cam: (N, 4, 4) true, in metres.
         """
-        start = STRIDE // 2
-        coarse = intrinsics.copy()
-        coarse[:2] /= STRIDE
-        coarse[:2, 2] -= start / STRIDE
         points = [
-            self._level(unproject(depth[start::STRIDE, start::STRIDE], coarse), pose)
+            self._level(coarse_points(depth, intrinsics), pose)
             for depth, pose in zip(depths, world_from_cam, strict=True)
         ]
         return _find_ground(np.concatenate(points))
@@ -75,28 +69,6 @@ class Pieces:
         known = points[np.isfinite(points[..., 2])]
         in_world = known @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
         return np.asarray(in_world @ self.level_from_world.T / self.median_m)
-
-
-def level_from_world(world_from_cam: Array) -> Array:
-    """Guess which way is down: across the cameras' x axes, for people and cars do not roll.
-
-    Where they all look the same way, it is the mean of their y axes.
-
-    Args:
-        world_from_cam: (N, 4, 4).
-
-    Returns:
-        (3, 3) rotation to axes with y down.
-    """
-    across = world_from_cam[:, :3, 0]
-    upright = world_from_cam[:, :3, 1].mean(axis=0)
-    upright /= max(float(np.linalg.norm(upright)), 1e-9)
-    cost = across.T @ across / len(across)
-    cost += UPRIGHT_WEIGHT * (np.eye(3) - np.outer(upright, upright))
-    down = np.linalg.eigh(cost)[1][:, 0]
-    down *= 1.0 if down @ upright >= 0 else -1.0
-    side = np.linalg.svd(down[None])[2][1]
-    return np.stack([side, down, np.cross(side, down)])
 
 
 def _find_ground(points: Array) -> Ground:
@@ -136,11 +108,10 @@ def _level_columns(column: NDArray[np.int64], y: Array, num: int) -> Array:
 
 
 def _spread(level: Array) -> Array:
-    """Give a column without ground that of its neighbours: a car or a facade stands on it."""
-    padded = np.pad(np.where(np.isfinite(level), level, np.nan), 1, constant_values=np.nan)
+    """Give a column without ground that of its lowest neighbour: a car or a wall stands on it."""
+    padded = np.pad(np.where(np.isfinite(level), level, -np.inf), 1, constant_values=-np.inf)
     rows, columns = level.shape
-    around = np.stack([padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)])
-    known = np.isfinite(around)
-    mean = np.where(known, around, 0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    filled = np.where(known.any(axis=0), mean, np.inf)
+    around = [padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3)]
+    lowest = np.max(around, axis=0)
+    filled = np.where(np.isfinite(lowest), lowest, np.inf)
     return np.where(np.isfinite(level), level, filled)

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 TrueDepth = Callable[[int], Map | None]
 
-PROBES = 8  # frames that are asked for true depth before the run
+SAMPLES = 8  # frames that are looked at before the run
 STRIDE = 4  # of the pixels that a median is taken of
 
 
@@ -45,8 +45,8 @@ class Truth:
     Attributes:
         intrinsics: (3, 3) in pixels of the depth maps.
         size: (height, width) of the depth maps.
-        median_m: median depth of the first frame that has any, in metres.
-        world_from_cam: (M, 4, 4) of the frames that have a true pose.
+        trajectory: of the frames that have a true pose, in metres.
+        samples: what is true of some frames all over the sequence that have depth.
 
     Raises:
         ConfigError: the data set lacks true poses or depth, or the intrinsics.
@@ -61,12 +61,13 @@ class Truth:
             raise _refusal("known intrinsics", info)
         if true_depth is None:
             raise _refusal("ground-truth depth", info)
-        self._true_depth, self._trajectory = true_depth, info.truth
+        self._true_depth, self.trajectory = true_depth, info.truth
         self._recent: dict[int, Map | None] = {}  # of the last window: the next shares some
         self.size = size
         self.intrinsics = resize_intrinsics(info.intrinsics, info.size, size)
-        self.world_from_cam = info.truth.world_from_cam
-        self.median_m = self._first_median(info)
+        self.samples = self._sample()
+        if not np.isfinite(self.samples.median_m):
+            raise _refusal("ground-truth depth", info)
 
     def window(self, frames: NDArray[np.int64]) -> WindowTruth:
         """Read the truth of some frames.
@@ -84,7 +85,7 @@ class Truth:
         }
         unknown = np.full(self.size, np.nan, np.float32)
         depths = [unknown if depth is None else depth for depth in self._recent.values()]
-        poses = complete_poses(frames, self._trajectory.frames, self.world_from_cam)
+        poses = complete_poses(frames, self.trajectory.frames, self.trajectory.world_from_cam)
         return WindowTruth(depths, poses, _median(depths), self._missing(frames))
 
     def _read(self, frame: int) -> Map | None:
@@ -96,7 +97,7 @@ class Truth:
         return np.asarray(cv2.resize(depth, self.size[::-1], interpolation=method), np.float32)
 
     def _missing(self, frames: NDArray[np.int64]) -> tuple[str, ...]:
-        without_pose = int((~np.isin(frames, self._trajectory.frames)).sum())
+        without_pose = int((~np.isin(frames, self.trajectory.frames)).sum())
         without_depth = sum(depth is None for depth in self._recent.values())
         warnings = []
         if without_pose:
@@ -105,18 +106,20 @@ class Truth:
             warnings.append(f"{without_depth} frames have no true depth: left unknown")
         return tuple(warnings)
 
-    def _first_median(self, info: SequenceInfo) -> float:
-        """Return the median depth of the first of some frames that has any."""
-        frames = self._trajectory.frames
-        for i in np.unique(np.linspace(0, len(frames) - 1, PROBES).astype(np.int64)):
-            depth = self._read(int(frames[i]))
-            median_m = np.nan if depth is None else _median([depth])
-            if np.isfinite(median_m):
-                return median_m
-        raise _refusal("ground-truth depth", info)
+    def _sample(self) -> WindowTruth:
+        """Read some frames all over the sequence, those that have a true pose."""
+        known = self.trajectory.frames
+        chosen = np.unique(np.linspace(0, len(known) - 1, SAMPLES).astype(np.int64))
+        read = {int(i): self._read(int(known[i])) for i in chosen}
+        depths = {i: depth for i, depth in read.items() if depth is not None}
+        poses = self.trajectory.world_from_cam[list(depths)]
+        return WindowTruth(list(depths.values()), poses, _median(list(depths.values())), ())
 
 
 def _median(depths: list[Map]) -> float:
+    """Return the median of the known depths; NaN: none is known."""
+    if not depths:
+        return float("nan")
     values = np.concatenate([depth[::STRIDE, ::STRIDE].ravel() for depth in depths])
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else float("nan")
