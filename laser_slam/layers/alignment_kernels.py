@@ -42,11 +42,11 @@ def carry_labels(labels, there, here, pixel_there_from_here, block):
             depth = M[2, 0] * x + M[2, 1] * y + M[2, 2] * z + M[2, 3]
             if not depth > 0:
                 continue
-            column = int((M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3]) / depth / block + 0.5)
-            row = int((M[1, 0] * x + M[1, 1] * y + M[1, 2] * z + M[1, 3]) / depth / block + 0.5)
-            if 0 <= row < height and 0 <= column < width:
-                if abs(there[row, column] - depth) < 0.15 * depth:
-                    out[v, u] = labels[row, column]
+            column = (M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3]) / depth / block + 0.5
+            row = (M[1, 0] * x + M[1, 1] * y + M[1, 2] * z + M[1, 3]) / depth / block + 0.5
+            if 0 <= row < height and 0 <= column < width:  # int() alone rounds towards zero
+                if abs(there[int(row), int(column)] - depth) < 0.15 * depth:
+                    out[v, u] = labels[int(row), int(column)]
     return out
 
 
