@@ -92,8 +92,8 @@ def _average_curve(forward: Layers, backward: Layers) -> Array:
     if not len(depths):
         return forward.curve
     knots = np.geomspace(depths.min(), depths.max(), _KNOTS)
-    curves = tuple(_at(layers.curve, knots) for layers in (forward, backward))
-    heard = tuple(np.float64(_witnesses_of_curve(layers)) for layers in (forward, backward))
+    curves = _at(forward.curve, knots), _at(backward.curve, knots)
+    heard = _witnesses_of_curve(forward), _witnesses_of_curve(backward)
     return np.stack([knots, np.exp(_mean_log(curves, heard))], axis=1)
 
 
@@ -104,10 +104,10 @@ def _at(curve: Array, knots: Array) -> Array:
     return np.asarray(np.interp(np.log(knots), *np.log(curve).T))
 
 
-def _witnesses_of_curve(layers: Layers) -> float:
+def _witnesses_of_curve(layers: Layers) -> Array:
     """Return how many windows stand behind a curve: as many as behind the layers it is made of."""
     heard = layers.witnesses[layers.witnesses > 1]
-    return float(np.median(heard)) if len(heard) else 1.0
+    return np.asarray(np.median(heard) if len(heard) else 1.0)
 
 
 def _mean_log(values: tuple[Array, Array], heard: tuple[Array, Array]) -> Array:
