@@ -123,7 +123,7 @@ def distort(depth: Map, keys: Keys, curve: Map, law: LayerLaw) -> Map:
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def add_noise(
     inverse: Map,
     fields: Map,
@@ -173,7 +173,7 @@ def add_noise(
             depth[y, x], confidence[y, x] = z, sure
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 def _bend(inverse: Map, y: int, x: int) -> float:
     """Return how much inverse depth bends, relative to itself: a plane does not, an edge does."""
     height, width = inverse.shape
