@@ -25,7 +25,7 @@ from laser_slam.pose_graph import (
     spread_poses,
     write_g2o,
 )
-from laser_slam.pose_graph.tangent import from_gtsam, local_covariance, parent_sigmas, to_gtsam
+from laser_slam.pose_graph.tangent import from_gtsam, local_information, parent_sigmas, to_gtsam
 from laser_slam.sim3 import Sim3, interpolate_sim3, rotation_exp, rotation_log
 from laser_slam.types import Registration
 
@@ -63,7 +63,7 @@ def test_the_sigmas_of_a_link_become_the_covariance_that_its_errors_have(seed: i
     rng = np.random.default_rng(seed)
     true, sigmas = random_sim3(rng), 1e-3 * np.exp(rng.normal(size=7))
     errors = local_errors(true, [disturb(true, sigmas, rng) for _ in range(4000)])
-    expected = local_covariance(true, sigmas)
+    expected = np.linalg.inv(local_information(true, sigmas))
     root = np.linalg.inv(np.linalg.cholesky(expected))
     sampled = root @ np.cov(errors.T) @ root.T
     np.testing.assert_allclose(sampled, np.eye(7), atol=5 / np.sqrt(2000))
@@ -85,7 +85,7 @@ def test_the_covariance_of_a_link_is_the_derivative_of_its_errors(seed: int) -> 
     moved = [disturb(true, small * sigmas, OneByOne(axis)) for axis in range(7)]  # type: ignore[arg-type]
     slopes = local_errors(true, moved) / small
     np.testing.assert_allclose(
-        slopes.T @ slopes, local_covariance(true, sigmas), rtol=1e-4, atol=1e-4
+        slopes.T @ slopes, np.linalg.inv(local_information(true, sigmas)), rtol=1e-4, atol=1e-4
     )
     np.testing.assert_allclose(parent_sigmas(true, slopes.T @ slopes), sigmas, rtol=1e-4)
 
@@ -215,14 +215,22 @@ def test_closures_may_come_one_by_one() -> None:
     assert result.cost_after == pytest.approx(expected.cost_after, rel=1e-3)
 
 
-def test_a_closure_left_out_too_early_comes_back_when_others_agree() -> None:
-    drive = measure(Plan(num=100, closures=0, growth=0.008), 3)
-    truth, graph = drive.truth, drive.graph()
-    for a, b in ((0, 99), (1, 98), (2, 97), (3, 96)):
-        sigmas = 0.3 * sigmas_in(truth[a])
-        graph.add_closure(a, b, truth[a].inverse() @ truth[b], sigmas)
-        result = graph.optimise()
-    assert result.is_trusted.all()
+@pytest.mark.parametrize("seed", range(2))
+def test_a_chain_gives_way_further_the_more_closures_agree(seed: int) -> None:
+    for growth, expected in ((0.002, [1, 2, 3]), (0.012, [0, 2, 3]), (0.02, [0, 0, 3])):
+        drive = measure(Plan(num=100, closures=0, growth=growth), seed)
+        truth, graph, trusted = drive.truth, drive.graph(), []
+        for a, b in ((0, 99), (1, 98), (2, 97)):
+            graph.add_closure(a, b, truth[a].inverse() @ truth[b], sigmas_in(truth[a]))
+            trusted.append(int(graph.optimise().is_trusted.sum()))
+        assert trusted == expected
+
+
+def test_right_closures_are_kept_without_any_doubt_about_the_chain() -> None:
+    for seed in range(3):
+        drive = measure(Plan(closures=20, wrong=6), seed)
+        is_trusted = drive.graph(PoseGraphConfig(max_stretch=1)).optimise().is_trusted
+        assert (is_trusted == drive.is_right).all()
 
 
 # Corrections of frames

@@ -39,9 +39,15 @@ class Drive:
     closures: list[tuple[int, int, Sim3, Array]]
     is_right: NDArray[np.bool_]
 
-    def graph(self, *, right_only: bool = False, start: Sequence[Sim3] | None = None) -> PoseGraph:
+    def graph(
+        self,
+        config: PoseGraphConfig | None = None,
+        *,
+        right_only: bool = False,
+        start: Sequence[Sim3] | None = None,
+    ) -> PoseGraph:
         """Put all in a new graph, windows at their chained places or at others."""
-        graph = PoseGraph(PoseGraphConfig())
+        graph = PoseGraph(config or PoseGraphConfig())
         for index, place in enumerate(start or self.chained):
             graph.add_window(index, place)
         for index, registration in enumerate(self.registrations, start=1):

@@ -35,8 +35,8 @@ def from_gtsam(b_from_a: Any) -> Sim3:
     return Sim3(scale, b_from_a.rotation().matrix(), scale * b_from_a.translation())
 
 
-def local_covariance(a_from_b: Sim3, sigmas: Array) -> Array:
-    """Return the (7, 7) covariance of GTSAM's tangent at a measured similarity.
+def local_information(a_from_b: Sim3, sigmas: Array) -> Array:
+    """Return the (7, 7) inverse covariance in GTSAM's tangent at a measured similarity.
 
     From ``R Exp(local) = Exp(parent) R`` and ``t + s R local = t + parent``: rotations turn back
     into b's axes, translations do too and change their unit. Where the sigmas of an axis differ,
@@ -55,8 +55,8 @@ def local_covariance(a_from_b: Sim3, sigmas: Array) -> Array:
         raise DegenerateGeometryError(
             f"a link of the pose graph needs 7 positive finite sigmas, got {values.tolist()}"
         )
-    local_from_parent = np.linalg.inv(_parent_from_local(a_from_b))
-    return np.asarray((local_from_parent * values**2) @ local_from_parent.T)
+    whitened_from_local = _parent_from_local(a_from_b) / values[:, None]
+    return np.asarray(whitened_from_local.T @ whitened_from_local)
 
 
 def parent_sigmas(a_from_b: Sim3, covariance: Array) -> Array:
