@@ -111,7 +111,11 @@ class FelzenszwalbSegmenter:
             window.depth,
             window.confidence,
         )
-        return np.stack(list(maps))
+        step = self._config.downscale
+        out = np.empty_like(window.depth[:, ::step, ::step], dtype=np.uint16, order="C")
+        for frame, labels in enumerate(maps):
+            out[frame] = labels
+        return out
 
     def _measure(self, window: Prediction) -> tuple[float, float]:
         """Return the window's unit of depth and the threshold of merging, in segmented values."""
@@ -150,7 +154,8 @@ class FelzenszwalbSegmenter:
         if config.min_size_px:
             min_size = config.min_size_px / config.downscale**2
         work = self._workspace(*values.shape)
-        labels = partition(values, config.scale, config.sigma, round(min_size), work)
+        sigma = config.sigma / config.downscale
+        labels = partition(values, config.scale, sigma, round(min_size), work)
         labels = merge_regions(labels, values, threshold, config.merge_rule)
         return labels.astype(np.uint16) if labels.max() <= MAX_LAYERS else close_gaps(labels)
 

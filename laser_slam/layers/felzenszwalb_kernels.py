@@ -103,19 +103,19 @@ def sort_edges(weights, spare, edges):
             value = bits[direction * num_pixels + p]
             if value < INFINITE_BITS:
                 key = np.uint32(value - base) if value > base else np.uint32(0)
-                d = (key >> LOW_SHIFT) & np.uint32(DIGITS - 1)
-                spare[low[d]] = (np.uint64(key) << np.uint64(32)) | tag | np.uint64(p)
-                low[d] += np.uint32(1)
+                place = (key >> LOW_SHIFT) & np.uint32(DIGITS - 1)
+                spare[low[place]] = (np.uint64(key) << np.uint64(32)) | tag | np.uint64(p)
+                low[place] += np.uint32(1)
     for e in range(num):
-        d = spare[e] >> np.uint64(32 + HIGH_SHIFT)
-        edges[high[d]] = spare[e]
-        high[d] += np.uint32(1)
+        digit = spare[e] >> np.uint64(32 + HIGH_SHIFT)
+        edges[high[digit]] = spare[e]
+        high[digit] += np.uint32(1)
     for e in range(1, num):  # the last 6 bits: few stand wrong, and none far
-        edge, place = edges[e], e
-        while place > 0 and edges[place - 1] > edge:
-            edges[place] = edges[place - 1]
-            place -= 1
-        edges[place] = edge
+        edge, to = edges[e], e
+        while to > 0 and edges[to - 1] > edge:
+            edges[to] = edges[to - 1]
+            to -= 1
+        edges[to] = edge
     return num, base
 
 
@@ -146,7 +146,7 @@ def join_by_weight(edges, base, offsets, scale, parents, sizes, limits):
         sizes[pixel] = 1
         limits[pixel] = scale
     for start in range(0, edges.size, CHUNK):
-        num_kept = 0  # first, without a branch, drop most edges inside a region
+        num_kept = np.int64(0)  # first, without a branch, drop most edges inside a region
         for e in range(start, min(start + CHUNK, edges.size)):
             edge = edges[e]
             pixel = edge & PIXEL_BITS

@@ -73,3 +73,34 @@ def close_gaps(labels: NDArray[np.integer]) -> NDArray[np.uint16]:
             "raise layers.segmentation.min_share or downscale, or use label maps with fewer labels"
         )
     return places[:-1].reshape(labels.shape).astype(np.uint16)
+
+
+def known_cells(window: Prediction, downscale: int) -> NDArray[np.bool_]:
+    """Return (N, h, w) True where a cell has a pixel of positive, finite, confident depth."""
+    depth = window.depth
+    is_known = (window.confidence > 0) & (depth > 0) & (depth < np.inf)
+    for axis in (1, 2):
+        starts = np.arange(0, depth.shape[axis], downscale)
+        is_known = np.logical_or.reduceat(is_known, starts, axis=axis)
+    return is_known
+
+
+def read_at_cells(
+    labels: NDArray[np.integer], size: tuple[int, int], downscale: int
+) -> NDArray[np.integer]:
+    """Read a label map of any size at the middle of the cells of a (height, width) depth map.
+
+    >>> read_at_cells(np.array([[1, 2], [3, 4]]), (4, 4), 1)[0]
+    array([1, 1, 2, 2])
+    """
+    rows, columns = (
+        _middles(pixels, downscale, places)
+        for pixels, places in zip(size, labels.shape, strict=True)
+    )
+    return np.asarray(labels[np.ix_(rows, columns)])
+
+
+def _middles(pixels: int, downscale: int, places: int) -> NDArray[np.int64]:
+    starts = np.arange(0, pixels, downscale)
+    middles = (starts + np.minimum(starts + downscale, pixels)) / 2
+    return (middles * places / pixels).astype(np.int64)
