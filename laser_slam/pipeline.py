@@ -29,13 +29,16 @@ from laser_slam.report import stages_picture
 from laser_slam.results import (
     Results,
     Scores,
+    StoredWindow,
+    describe_layers,
     describe_sequence,
     draw_depth,
+    draw_layers,
     draw_map,
     draw_trajectory,
     peak_memory_mib,
     sample_views,
-    score_depth,
+    score_views,
     versions,
     write_report,
     write_trajectories,
@@ -223,7 +226,8 @@ class Pipeline:
         """Read the stored windows back, one at a time, at their final places."""
         nodes = self._slam.nodes
         for node in nodes:
-            yield node.submap(*self._load(node.index))
+            window = self._load(node.index)
+            yield node.submap(window.corrected, window.colors)
             self._on_progress("fusing", node.index + 1, len(nodes))
 
     def _fuse(self) -> Cloud:
@@ -239,13 +243,7 @@ class Pipeline:
         truth, errors = self._info.truth, None
         if truth is not None:
             errors = evaluate_trajectory(trajectory, truth)
-        depth = score_depth(
-            views,
-            self._true_depth,
-            errors.scale if errors else None,
-            self._config.fusion.min_confidence,
-        )
-        return Scores(errors, depth, views)
+        return score_views(views, errors, self._true_depth, self._config.fusion.min_confidence)
 
     def _true_depth(self, frame: int) -> NDArray[np.float32] | None:
         truth = self._dataset.true_depth(frame)
@@ -260,6 +258,7 @@ class Pipeline:
             draw_trajectory(pictures, trajectory, self._info.truth, scores.trajectory)
             draw_map(pictures, trajectory, cloud)
             draw_depth(pictures, scores.views)
+            draw_layers(pictures, scores.views, self._slam.nodes)
         stages_picture(pictures / "stages.png", dict(self._clock.wall_s))
 
     def _report(self, cloud: Cloud, scores: Scores, warnings: list[str]) -> dict[str, Any]:
@@ -269,6 +268,8 @@ class Pipeline:
             "windows": {"num": len(self._slam.nodes), "bridged": self._slam.bridged},
             "trajectory": scores.trajectory.numbers() if scores.trajectory else None,
             "depth": scores.depth,
+            "depth_without_layers": scores.raw_depth,
+            "layers": describe_layers(self._slam.nodes),
             "map": {"num_points": len(cloud.points), "voxel_size": cloud.voxel_size},
             "warnings": warnings,
             **self._clock.report(len(self._input.times_s)),
@@ -277,13 +278,12 @@ class Pipeline:
             "settings": self._config.model_dump(mode="json"),
         }
 
-    def _load(self, index: int) -> tuple[Prediction, Image]:
-        """Read a window back, its layers' scales applied."""
-        prediction, colors = self._files.load(index)
-        if self._config.has_layers:
-            layers = self._files.load_layers(index)
-            prediction = apply_layers(prediction, layers, self._config.layers)
-        return prediction, colors
+    def _load(self, index: int) -> StoredWindow:
+        raw, colors = self._files.load(index)
+        if not self._config.has_layers:
+            return StoredWindow(raw, raw, colors, None)
+        layers = self._files.load_layers(index)
+        return StoredWindow(raw, apply_layers(raw, layers, self._config.layers), colors, layers)
 
 
 def _resize(images: tuple[Image, ...], size: tuple[int, ...]) -> Image:

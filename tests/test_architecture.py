@@ -40,7 +40,7 @@ def may_import(part: str) -> set[str]:
         return {*ROOTS[: ROOTS.index(part)], part}
     if part in STAGES:
         return {*ROOTS, part}
-    return {*ROOTS, *STAGES, *COMPOSITION[: COMPOSITION.index(part)]}
+    return {*ROOTS, *STAGES, *COMPOSITION[: COMPOSITION.index(part)], part}
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))

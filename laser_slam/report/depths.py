@@ -1,4 +1,4 @@
-"""The contact sheet of images, depth and confidence."""
+"""Contact sheets of images and what is known of them pixel by pixel."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.report.style import INK, WIDTH_PX, picture
+from laser_slam.report.sheet import contact_sheet
 from laser_slam.types import Image
 
 _UNKNOWN = "#32373d"
-_GAP_PX = 10
-_HEAD_PX = 50
 _TITLES = ("image", "inverse depth (grey: unknown)", "confidence")
 
 
@@ -38,24 +36,8 @@ def depth_picture(
     Raises:
         RunFolderError: the picture cannot be written.
     """
-    column_px = (WIDTH_PX - 4 * _GAP_PX) // 3
-    rows_px = [round(column_px * image.shape[0] / image.shape[1]) for image in images]
-    height_px = _HEAD_PX + sum(row + _GAP_PX for row in rows_px)
-    panels = [_colored(depths, confidences, i) for i in range(len(images))]
-    with picture(path, max(height_px, 2 * _HEAD_PX), layout=None) as figure:
-        top = _HEAD_PX
-        for image, (depth, confidence), row_px in zip(images, panels, rows_px, strict=True):
-            for column, panel in enumerate((image, depth, confidence)):
-                left = _GAP_PX + column * (column_px + _GAP_PX)
-                box = (left, height_px - top - row_px, column_px, row_px)
-                figure.add_axes(_relative(box, height_px), frameon=False).imshow(
-                    panel, aspect="auto", interpolation="antialiased"
-                )
-                figure.axes[-1].set_axis_off()
-            top += row_px + _GAP_PX
-        for column, title in enumerate(_TITLES):
-            x = (_GAP_PX + column * (column_px + _GAP_PX)) / WIDTH_PX
-            figure.text(x, 1 - 0.5 * _HEAD_PX / height_px, title, va="center", color=INK)
+    panels = [(image, *_colored(depths, confidences, i)) for i, image in enumerate(images)]
+    contact_sheet(path, panels, _TITLES)
 
 
 def _colored(
@@ -66,7 +48,7 @@ def _colored(
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(depths[i] > 0, 1 / depths[i], np.nan)
     level = np.clip((inverse - low) / max(high - low, 1e-12), 0, 1)
-    return _paint(level, "turbo"), _paint(confidences[i], "viridis")
+    return paint(level, "turbo"), paint(confidences[i], "viridis")
 
 
 def _inverse_range(depths: Sequence[NDArray[np.float32]]) -> tuple[float, float]:
@@ -77,13 +59,7 @@ def _inverse_range(depths: Sequence[NDArray[np.float32]]) -> tuple[float, float]
     return float(far), float(near)
 
 
-def _paint(level: NDArray[Any], colors: str) -> Image:
+def paint(level: NDArray[Any], colors: str) -> Image:
+    """Return the (H, W, 3) colours of (H, W) levels in [0, 1]; grey: not a number."""
     palette = matplotlib.colormaps[colors].with_extremes(bad=_UNKNOWN)
     return np.asarray(palette(np.ma.masked_invalid(level), bytes=True)[..., :3])
-
-
-def _relative(
-    box_px: tuple[int, int, int, int], height_px: int
-) -> tuple[float, float, float, float]:
-    left, bottom, width, height = box_px
-    return (left / WIDTH_PX, bottom / height_px, width / WIDTH_PX, height / height_px)
