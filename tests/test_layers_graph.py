@@ -16,6 +16,7 @@ from laser_slam.types import Prediction
 
 Labels = NDArray[np.uint16]
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 SIZE = (40, 64)
 
 
@@ -263,7 +264,7 @@ def test_following_links_what_moves_by_its_own_width() -> None:
 # --- Algorithm 1 --------------------------------------------------------------------------------
 
 
-def algorithm_1(inter: Edges, scales: Array, intra: Edges, starts: Array) -> tuple[Array, Array]:
+def algorithm_1(inter: Edges, scales: Array, intra: Edges, starts: Indices) -> tuple[Array, Array]:
     """Propagate as the paper prints it: loops over edges and frames."""
     num = int(starts[-1])
     A, W = [0.0] * num, [0.0] * num
@@ -281,7 +282,7 @@ def algorithm_1(inter: Edges, scales: Array, intra: Edges, starts: Array) -> tup
     return np.array(s), np.array(W)
 
 
-def random_graph(seed: int) -> tuple[Edges, Edges, Array]:
+def random_graph(seed: int) -> tuple[Edges, Edges, Indices]:
     """Layers of 6 frames, the first 3 shared; a third of all possible edges."""
     rng = np.random.default_rng(seed)
     starts = np.concatenate([[0], np.cumsum(rng.integers(0, 7, 6))])

@@ -19,8 +19,8 @@ Indices = NDArray[np.int64]
 
 _LENGTH = 1.0  # log depth over which the curve forgets itself
 _MIN_SIGMA = 1e-3  # log-ratio below which nothing is worth a correction
-_NOISE_SUPPORT = 60.0  # cells with which a layer's own noise counts as much as what all share
 _STRENGTHS = (0.0, 0.3, 0.7, 1.2)  # of curve and layers, in spreads of the ratios
+_MARGIN = 2.0  # of log evidence that a part must bring: noise alone brings a little every time
 _MAX_OBSERVATIONS = 240
 _NEIGHBOURHOOD = 0.15  # image widths over which neighbours cease to be parts of one thing
 _SURFACE = 0.6  # of log depth, the same
@@ -91,6 +91,7 @@ def explain(observed: Observations, num_tracks: int, *, with_curve: bool) -> Dis
         for layer in _STRENGTHS:
             covariance = spread**2 * (curve**2 * near + layer**2 * same) + noise
             evidence = _evidence(covariance, observed.log_ratio)
+            evidence -= _MARGIN * ((curve > 0) + (layer > 0))
             if evidence > best:
                 best, chosen = evidence, (curve * spread, layer * spread)
     if max(chosen) < _MIN_SIGMA:
