@@ -70,7 +70,8 @@ def partition(
     edges, forest = work.edges[:num], (work.parents, work.sizes)
     refused = kernels.join_by_weight(edges, base, work.offsets, scale / 255, *forest, work.limits)
     kernels.join_small(edges[:refused], work.offsets, min_size, *forest)
-    kernels.join_islands(*kernels.gap_edges(blurred, *forest, min_size), min_size, *forest)
+    if np.isnan(blurred).any():
+        kernels.join_islands(*kernels.gap_edges(blurred, *forest, min_size), min_size, *forest)
     labels = np.empty(image.shape, np.int32)
     kernels.number_regions(blurred, work.parents, work.spare.view(np.int32), labels)
     return labels

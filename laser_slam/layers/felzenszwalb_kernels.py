@@ -220,18 +220,15 @@ def gap_edges(image, parents, sizes, min_size):
     for fill in range(2):  # count, then fill
         if fill == 1:
             weights, pairs, num = np.empty(num), np.empty((num, 2), np.int64), 0
-        for axis in range(2):
-            for a in range(height if axis == 0 else width):
-                last = -1
-                for b in range(width if axis == 0 else height):
-                    i, j = (a, b) if axis == 0 else (b, a)
-                    if np.isnan(image[i, j]):
+        above = np.full(width, -1)  # rows of the last known pixels
+        for i in range(height):
+            left = -1
+            for j in range(width):
+                if np.isnan(image[i, j]):
+                    continue
+                for k, m in ((i, left), (above[j], j)):
+                    if k < 0 or m < 0 or (i - k) + (j - m) == 1:
                         continue
-                    gap, before = b - last, last
-                    last = b
-                    if before < 0 or gap == 1:
-                        continue
-                    k, m = (a, before) if axis == 0 else (before, a)
                     one = find_root(parents, np.uint64(i * width + j))
                     two = find_root(parents, np.uint64(k * width + m))
                     if one == two or (sizes[one] >= min_size and sizes[two] >= min_size):
@@ -240,6 +237,7 @@ def gap_edges(image, parents, sizes, min_size):
                         weights[num] = abs(image[i, j] - image[k, m])
                         pairs[num, 0], pairs[num, 1] = one, two
                     num += 1
+                left, above[j] = j, i
     return weights, pairs
 
 
