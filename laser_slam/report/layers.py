@@ -14,8 +14,8 @@ from laser_slam.report.sheet import contact_sheet
 from laser_slam.report.style import ACCENT, SECOND, picture
 from laser_slam.types import Image
 
-_REACH = 0.25  # log factor at the ends of the colours
-_TITLES = ("image", "layers", "scale (blue: nearer, red: farther, to 25 %)")
+_REACH = 0.223  # log factor at the ends of the colours: 0.8 and 1.25
+_TITLES = ("image", "layers", "scale (blue 0.8, red 1.25)")
 
 
 def layers_picture(
