@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.config import LayersConfig
-from laser_slam.layers.correction import corrected_depth
+from laser_slam.layers.correction import corrected_cells
 from laser_slam.layers.graph import Edges, first_rows, inter_window_edges, intra_window_edges
 from laser_slam.layers.opinions import Opinions, ask
 from laser_slam.layers.propagation import propagate
-from laser_slam.layers.shared import cells, edge_of_cell, shared_depth
+from laser_slam.layers.shared import edge_of_cell, shared_depth
 from laser_slam.types import Layers, Prediction
 
 Labels = NDArray[np.uint16]
@@ -96,7 +96,7 @@ def align_layers(
     opinions = ask(shared, edge, (inter, intra), witnesses, config)
     onward = intra if config.intra else intra.chosen(np.zeros(len(intra), dtype=bool))
     layers, counts = _spread_scales(labels, (inter, onward), opinions, scale, config)
-    after = scale * cells(corrected_depth(current, layers, in_b, config), config)
+    after = scale * corrected_cells(current, layers, in_b, config)
     return layers, LayerCounts(
         **counts,
         curve_sigma=opinions.distortion.strengths[0],

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.config import LayersConfig
-from laser_slam.layers.alignment_kernels import scale_depth, smooth_along_surfaces
+from laser_slam.layers.correction_kernels import add_curve, scale_depth, spread_scales
 from laser_slam.types import Layers, Prediction
 
 Float = NDArray[np.float32]
+
+MAX_STEP = np.float32(0.03)  # of log depth from cell to cell, beyond which a surface ends
+_KNOTS = 4096  # of the curve, evenly spaced: no search; 1e-3 of log depth apart
 
 
 def apply_layers(prediction: Prediction, layers: Layers, config: LayersConfig) -> Prediction:
@@ -24,26 +26,28 @@ def apply_layers(prediction: Prediction, layers: Layers, config: LayersConfig) -
         layers: of the same window.
         config: how far scales blend on surfaces that go on across the border of two layers.
     """
-    frames = range(len(prediction.frames))
-    return replace(prediction, depth=corrected_depth(prediction, layers, frames, config))
+    if _changes_nothing(layers):
+        return prediction
+    block = config.segmentation.downscale
+    if block == 1:
+        frames = range(len(prediction.frames))
+        return replace(prediction, depth=corrected_cells(prediction, layers, frames, config))
+    out = np.empty_like(prediction.depth, order="C")
+    for frame, depth in enumerate(prediction.depth):
+        cells = _cells(depth, config)
+        scale_depth(depth, cells, _factors(cells, layers, frame, config), block, out[frame])
+    return replace(prediction, depth=out)
 
 
-def corrected_depth(
+def corrected_cells(
     prediction: Prediction, layers: Layers, frames: Iterable[int], config: LayersConfig
 ) -> Float:
-    """Return the (K, H, W) corrected depth of some frames of the window, in window units."""
+    """Return the (K, h, w) corrected depth of the cells of some frames, in window units."""
     chosen = list(frames)
-    out: Float = np.empty((len(chosen), *prediction.depth.shape[1:]), np.float32)
-
-    def correct(k: int) -> None:
-        depth = prediction.depth[chosen[k]]
-        _correct(depth, _of_frame(layers, chosen[k]), layers.curve, config, out[k])
-
-    if _changes_nothing(layers):
-        out[:] = prediction.depth[chosen]
-        return out
-    with ThreadPoolExecutor() as pool:
-        list(pool.map(correct, range(len(chosen))))
+    out = np.array([_cells(prediction.depth[frame], config) for frame in chosen])
+    if not _changes_nothing(layers):
+        for k, frame in enumerate(chosen):
+            out[k] *= _factors(out[k], layers, frame, config)
     return out
 
 
@@ -51,28 +55,24 @@ def _changes_nothing(layers: Layers) -> bool:
     return not len(layers.curve) and bool((layers.scales == 1).all())
 
 
-def _of_frame(layers: Layers, frame: int) -> NDArray[np.float32]:
-    """Return the (h, w) log factor of each cell from its layer; 0: unknown."""
-    rows = layers.scales[layers.starts[frame] : layers.starts[frame + 1]]
-    table = np.concatenate([[0.0], np.log(rows)]).astype(np.float32)
-    out: Float = table[layers.labels[frame]]
-    return out
-
-
-def _correct(
-    depth: Float, log_factor: Float, curve: NDArray[np.float64], config: LayersConfig, out: Float
-) -> None:
+def _cells(depth: Float, config: LayersConfig) -> Float:
     block = config.segmentation.downscale
-    cells = np.ascontiguousarray(depth[::block, ::block])
+    return np.ascontiguousarray(depth[::block, ::block])
+
+
+def _factors(cells: Float, layers: Layers, frame: int, config: LayersConfig) -> Float:
+    """Return the (h, w) factor of each cell of a frame; 1 where depth is unknown."""
     with np.errstate(divide="ignore", invalid="ignore"):
         log_depth = np.log(cells)
-    if config.feather > 0:
-        smooth_along_surfaces(log_factor, log_depth, np.float32(config.feather / block), MAX_STEP)
-    if len(curve):
-        knots = np.log(curve)
-        log_factor += np.interp(log_depth, knots[:, 0], knots[:, 1])
-    factor = np.nan_to_num(np.exp(log_factor), nan=1.0).astype(np.float32)
-    scale_depth(depth, cells, factor, block, out)
-
-
-MAX_STEP = np.float32(0.03)  # of log depth from cell to cell, beyond which a surface ends
+    scales = layers.scales[layers.starts[frame] : layers.starts[frame + 1]]
+    by_label = np.log(np.append(1.0, scales)).astype(np.float32)
+    reach = config.feather / config.segmentation.downscale
+    fade = np.float32(np.exp(-1 / reach) if reach > 0 else 0.0)
+    out: Float = spread_scales(layers.labels[frame], by_label, log_depth, fade, MAX_STEP)
+    if len(layers.curve):
+        depths, factors = np.log(layers.curve).T
+        even = np.linspace(depths[0], depths[-1], _KNOTS)
+        per_unit = np.float32((_KNOTS - 1) / max(depths[-1] - depths[0], 1e-6))
+        curve = np.interp(even, depths, factors).astype(np.float32)
+        add_curve(out, log_depth, np.float32(depths[0]), per_unit, curve)
+    return np.exp(out, out=out)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.config import LayersConfig
-from laser_slam.layers.correction import corrected_depth
+from laser_slam.layers.correction import corrected_cells
 from laser_slam.layers.graph import Edges
 from laser_slam.types import Layers, Prediction
 
@@ -60,7 +60,7 @@ def shared_depth(
         config: how cells are taken and trusted.
     """
     (before, layers_before), (in_a, in_b) = previous, shared
-    target = cells(corrected_depth(before, layers_before, in_a, config), config)
+    target = corrected_cells(before, layers_before, in_a, config)
     source = np.float32(scale) * cells(current.depth[in_b], config)
     trust = np.sqrt(
         cells(before.confidence[in_a], config) * cells(current.confidence[in_b], config)
