@@ -43,6 +43,11 @@ COLUMNS = (
 )
 
 
+# The first window of a street is the truth but for noise. The default settings take a window for
+# one opinion among many, so they must be told; with 1 they correct half of what they see.
+TRUTH = 1e6
+
+
 @dataclass(frozen=True)
 class Row:
     """One case under one set of settings.
@@ -71,7 +76,7 @@ def measure(pair: Pair, config: Config, witnesses: float) -> Array:
     Args:
         pair: the windows and the truth.
         config: all settings.
-        witnesses: windows that the first one stands for; it is the truth, but nothing says so.
+        witnesses: windows that the first one stands for.
     """
     registration = register(pair.previous, pair.current, config.registration)
     scale = registration.previous_from_current.scale
@@ -156,7 +161,7 @@ def main(  # noqa: PLR0913, PLR0917  (the options of a command)
     seeds: Annotated[int, typer.Option(min=1, help="streets to average over")] = 3,
     witnesses: Annotated[
         float, typer.Option(min=1, help="windows that the first one stands for, see layers.memory")
-    ] = 1,
+    ] = TRUTH,
     tall: Annotated[bool, typer.Option("--tall", help="294x518 instead of 154x518")] = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="print Markdown")] = False,
 ) -> None:
