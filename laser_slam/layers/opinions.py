@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from laser_slam.config import LayersConfig
 from laser_slam.layers.graph import Edges
+from laser_slam.layers.ratio_kernels import sum_by_group
 from laser_slam.layers.ratios import Pairs, Ratios, measure_ratios
 from laser_slam.layers.shared import SharedDepth
 from laser_slam.layers.shrinkage import NO_DISTORTION, Distortion, explain
@@ -18,6 +19,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _BIN = 0.2  # of log depth: what a curve may treat differently
+_SAMPLES = 10_000  # depths that tell where the bins begin
 
 
 @dataclass(frozen=True)
@@ -71,25 +73,26 @@ def _measure(
     shared: SharedDepth, edge_of_cell: Indices, config: LayersConfig
 ) -> tuple[Pieces, Indices]:
     """Measure each edge, apart for each range of depth; return what can be trusted and its edge."""
-    used = (edge_of_cell >= 0) & (shared.weight > 0)
-    edge, source = edge_of_cell[used], shared.source[used]
+    used = np.flatnonzero((edge_of_cell >= 0) & (shared.weight > 0))
+    edge = edge_of_cell.reshape(-1)[used]
+    source, target, weight = (
+        maps.reshape(-1)[used] for maps in (shared.source, shared.target, shared.weight)
+    )
     log_depth = np.log(source)
     depth_bin, num_bins = _bins(log_depth, is_split=config.shrink)
     occupied, group = _numbered(edge * num_bins + depth_bin)
-    pairs = Pairs(group, source, shared.target[used], shared.weight[used], len(occupied))
-    ratios = measure_ratios(pairs, config.scale)
-    trusted = _is_trusted(ratios, edge_of_cell[0].size, config)
-    _, v, u = np.nonzero(used)
-    depth, row, column = (
-        np.bincount(group, values, minlength=len(occupied)) / ratios.support
-        for values in (log_depth, v, u)
-    )
+    ratios = measure_ratios(Pairs(group, source, target, weight, len(occupied)), config.scale)
+    _, height, width = edge_of_cell.shape
+    trusted = _is_trusted(ratios, height * width, config)
+    place = used % (height * width)
+    sums = sum_by_group(group, place, width, log_depth, len(occupied))
+    depth, column, row = sums / ratios.support
     pieces = Pieces(
         log_ratio=ratios.log_ratio[trusted],
         support=ratios.support[trusted],
         depth_bin=(occupied % num_bins)[trusted],
         log_depth=depth[trusted],
-        place=np.stack([row, column], axis=1)[trusted] / used.shape[2],
+        place=np.stack([row, column], axis=1)[trusted] / width,
     )
     return pieces, (occupied // num_bins)[trusted]
 
@@ -98,7 +101,8 @@ def _bins(log_depth: NDArray[np.float32], *, is_split: bool) -> tuple[Indices, i
     """Return (P,) the range of depth of each pixel, and how many ranges there are."""
     if not is_split or not len(log_depth):
         return np.zeros(len(log_depth), np.int64), 1
-    steps = (log_depth - np.median(log_depth)) / _BIN
+    middle = np.median(log_depth[:: len(log_depth) // _SAMPLES + 1])
+    steps = (log_depth - middle) / _BIN
     bins = np.floor(steps - steps.min()).astype(np.int64)
     return bins, int(bins.max()) + 1
 

@@ -9,12 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from laser_slam.layers.ratio_kernels import (
+    BINS,
+    REACH,
+    first_to_reach,
+    rising_mass,
+    rising_mass_inside,
+)
+
 Array = NDArray[np.float64]
 Float = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
-_BINS = 256  # of the histograms; two rounds of them resolve 4e-5 of the log-ratio
-_REACH = 1.4  # natural logarithm of the largest ratio that is told apart from larger ones
+_WIDTH = 2 * REACH / BINS  # of a bin
 _MAX_ROUNDS = 100
 _TOLERANCE = 1e-6  # relative
 _HUBER_DELTA = 0.1  # in median depths of the group
@@ -118,56 +125,30 @@ def _sums(pairs: Pairs, values: NDArray[Any]) -> Array:
 
 def _median_of(pairs: Pairs, values: Float, weight: Float) -> Array:
     """Return (G,) weighted medians: a histogram of each group, then one of its decisive bin."""
-    width = 2 * _REACH / _BINS
-    decisive, before, _ = _decisive_bins(pairs, values, weight, 0.5)
-    # The same rounding as in the first round: no value may fall between two bins.
-    fine = (_positions(values) - decisive.astype(np.float32)[pairs.group]) * _BINS
-    inside = (fine >= 0) & (fine < _BINS)
-    counts = _histogram(pairs, fine[inside], inside, weight)
-    mass = before[:, None] + counts.cumsum(axis=1)
-    half = 0.5 * _sums(pairs, weight)
-    low = decisive * width - _REACH
-    return np.asarray(low + (_rank(mass, half) + 0.5) * width / _BINS)
+    weight = weight.astype(np.float32, copy=False)
+    coarse = rising_mass(pairs.group, values, weight, pairs.num_groups)
+    decisive, before, _ = _quantile(coarse, 0.5)
+    fine = rising_mass_inside(pairs.group, values, weight, decisive)
+    part = first_to_reach(fine, 0.5 * coarse[:, -1] - before)
+    return np.asarray((decisive + (part + 0.5) / BINS) * _WIDTH - REACH)
 
 
 def _quartile_distance(pairs: Pairs, values: Float) -> Array:
     """Return (G,) distance of the weighted quartiles, linear inside the bins of a histogram."""
+    mass = rising_mass(pairs.group, values, pairs.weight, pairs.num_groups)
     first, third = (
         decisive + fraction
         for share in (0.25, 0.75)
-        for decisive, _, fraction in [_decisive_bins(pairs, values, pairs.weight, share)]
+        for decisive, _, fraction in [_quantile(mass, share)]
     )
-    return np.asarray((third - first) * 2 * _REACH / _BINS)
+    return np.asarray((third - first) * _WIDTH)
 
 
-def _decisive_bins(
-    pairs: Pairs, values: Float, weight: Float, share: float
-) -> tuple[Array, Array, Array]:
+def _quantile(mass: Array, share: float) -> tuple[Indices, Array, Array]:
     """Return (G,) the bin that holds a quantile, the weight before it, and how far in it lies."""
-    position = _positions(values)
-    mass = _histogram(pairs, position, np.ones(len(values), dtype=bool), weight).cumsum(axis=1)
     wanted = share * mass[:, -1]
-    decisive = _rank(mass, wanted)
+    decisive: Indices = first_to_reach(mass, wanted)
     row = np.arange(len(mass))
     before = np.where(decisive > 0, mass[row, decisive - 1], 0.0)
     inside = np.maximum(mass[row, decisive] - before, 1e-30)
-    return decisive.astype(np.float64), before, ((wanted - before) / inside).clip(0, 1)
-
-
-def _positions(values: Float) -> Float:
-    """Return (P,) bin and place in it of each value; what is out of reach is at the end."""
-    position = (values + _REACH) * (_BINS / (2 * _REACH))
-    return np.asarray(position.clip(0, _BINS - 1e-3), np.float32)
-
-
-def _histogram(
-    pairs: Pairs, position: NDArray[Any], used: NDArray[np.bool_], weight: Float
-) -> Array:
-    cell = pairs.group[used] * _BINS + position.astype(np.int64)
-    counts = np.bincount(cell, weight[used], minlength=pairs.num_groups * _BINS)
-    return np.asarray(counts.reshape(-1, _BINS), np.float64)
-
-
-def _rank(mass: Array, wanted: Array) -> Indices:
-    """Return (G,) the first bin where (G, B) rising ``mass`` reaches ``wanted``."""
-    return np.asarray((mass < wanted[:, None]).sum(axis=1).clip(0, mass.shape[1] - 1), np.int64)
+    return decisive, before, ((wanted - before) / inside).clip(0, 1)

@@ -79,30 +79,43 @@ def explain(observed: Observations, num_tracks: int, *, with_curve: bool) -> Dis
     nothing = Distortion(np.empty(0), np.empty(0), np.zeros(num_tracks), (0.0, 0.0))
     if len(observed.log_ratio) < 2:
         return nothing
-    spread = float(np.sqrt(np.mean(observed.log_ratio**2)))
-    step = np.abs(observed.log_depth[:, None] - observed.log_depth)
-    near = np.exp(-step / _LENGTH)
-    apart = np.abs(observed.place[:, None] - observed.place).sum(axis=2)
-    same = 0.5 * (observed.track[:, None] == observed.track)
-    same += 0.5 * np.exp(-apart / _NEIGHBOURHOOD - step / _SURFACE)
-    noise = np.diag(observed.variance)
-    best, chosen = -np.inf, (0.0, 0.0)
-    for curve in _STRENGTHS if with_curve else (0.0,):
-        for layer in _STRENGTHS:
-            covariance = spread**2 * (curve**2 * near + layer**2 * same) + noise
-            evidence = _evidence(covariance, observed.log_ratio)
-            evidence -= _MARGIN * ((curve > 0) + (layer > 0))
-            if evidence > best:
-                best, chosen = evidence, (curve * spread, layer * spread)
+    near, same = _alike(observed)
+    chosen = _likeliest(near, same, observed, _STRENGTHS if with_curve else (0.0,))
     if max(chosen) < _MIN_SIGMA:
         return nothing
-    covariance = chosen[0] ** 2 * near + chosen[1] ** 2 * same + noise
+    covariance = chosen[0] ** 2 * near + chosen[1] ** 2 * same + np.diag(observed.variance)
     pull = cho_solve(cho_factor(covariance), observed.log_ratio)
     own = chosen[1] ** 2 * same @ pull
     of_track = _means(own, observed, num_tracks)
     knots = _knots(observed.log_depth) if chosen[0] else np.empty(0)
     curve_there = chosen[0] ** 2 * np.exp(-np.abs(knots[:, None] - observed.log_depth) / _LENGTH)
     return Distortion(knots, curve_there @ pull, np.asarray(of_track), chosen)
+
+
+def _alike(observed: Observations) -> tuple[Array, Array]:
+    """Return (G, G) how alike curve and tracks' own parts are for each two observations."""
+    step = np.abs(observed.log_depth[:, None] - observed.log_depth)
+    apart = sum(np.abs(axis[:, None] - axis) for axis in observed.place.T)
+    same = 0.5 * (observed.track[:, None] == observed.track)
+    same += 0.5 * np.exp(-apart / _NEIGHBOURHOOD - step / _SURFACE)
+    return np.exp(-step / _LENGTH), same
+
+
+def _likeliest(
+    near: Array, same: Array, observed: Observations, curves: tuple[float, ...]
+) -> tuple[float, float]:
+    """Return the standard deviations of curve and tracks' own parts with the most evidence."""
+    spread = float(np.sqrt(np.mean(observed.log_ratio**2)))
+    own = [(spread * layer) ** 2 * same for layer in _STRENGTHS]
+    best, chosen = -np.inf, (0.0, 0.0)
+    for curve in curves:
+        others = (spread * curve) ** 2 * near + np.diag(observed.variance)
+        for layer, part in zip(_STRENGTHS, own, strict=True):
+            evidence = _evidence(others + part, observed.log_ratio)
+            evidence -= _MARGIN * ((curve > 0) + (layer > 0))
+            if evidence > best:
+                best, chosen = evidence, (curve * spread, layer * spread)
+    return chosen
 
 
 def _strongest(observed: Observations) -> Observations:
@@ -126,8 +139,11 @@ def _means(values: Array, observed: Observations, num_tracks: int) -> Array:
 
 
 def _evidence(covariance: Array, values: Array) -> float:
-    """Return the log-likelihood of (G,) values under a normal distribution, up to a constant."""
-    factor = cho_factor(covariance, check_finite=False)
+    """Return the log-likelihood of (G,) values under a normal distribution, up to a constant.
+
+    The covariance is overwritten.
+    """
+    factor = cho_factor(covariance.T, overwrite_a=True, check_finite=False)
     spread = 2 * np.log(np.diag(factor[0])).sum()
     return float(-0.5 * (values @ cho_solve(factor, values, check_finite=False) + spread))
 
