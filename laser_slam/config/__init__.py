@@ -1,6 +1,7 @@
 """Every setting, and how settings are read."""
 
 from laser_slam.config.loading import dump_config, load_config, setting_names, shipped_configs
+from laser_slam.config.places import PlacesConfig, VerificationConfig
 from laser_slam.config.sections import (
     BackboneConfig,
     CalibrationConfig,
@@ -26,12 +27,14 @@ __all__ = [
     "DatasetConfig",
     "FusionConfig",
     "LayersConfig",
+    "PlacesConfig",
     "PoseGraphConfig",
     "RegistrationConfig",
     "RunConfig",
     "SegmentationConfig",
     "SimulatedConfig",
     "SyntheticConfig",
+    "VerificationConfig",
     "WindowsConfig",
     "dump_config",
     "load_config",

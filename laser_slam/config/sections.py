@@ -6,6 +6,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from laser_slam.config.places import PlacesConfig
 from laser_slam.config.section import Section as _Section
 from laser_slam.config.simulated import SimulatedConfig
 
@@ -161,6 +162,9 @@ class LayersConfig(_Section):
     memory: int = Field(
         20, ge=0, description="windows whose opinions a scale averages; 0: the one before is right"
     )
+    feed_back: bool = Field(
+        False, description="the next window is registered to corrected depth, as the official code"
+    )
     smooth: bool = Field(
         True, description="with memory: a second pass, backwards, for what later windows say"
     )
@@ -245,6 +249,7 @@ class Config(_Section):
     backbone: BackboneConfig = BackboneConfig()
     registration: RegistrationConfig = RegistrationConfig()
     layers: LayersConfig = LayersConfig()
+    places: PlacesConfig = PlacesConfig()
     pose_graph: PoseGraphConfig = PoseGraphConfig()
     fusion: FusionConfig = FusionConfig()
     synthetic: SyntheticConfig = SyntheticConfig()

@@ -1,0 +1,50 @@
+"""The settings of place recognition."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from laser_slam.config.section import Section
+
+
+class VerificationConfig(Section):
+    """Whether two images show one place, by geometry."""
+
+    width: int = Field(640, ge=160, description="images wider than this are reduced, px")
+    num_features: int = Field(1000, ge=50, description="features per image")
+    max_ratio: float = Field(
+        0.8, gt=0, le=1, description="distance of a match over that of the second best"
+    )
+    max_error_px: float = Field(
+        1.0, gt=0, description="distance from the epipolar line of an inlier, px at this width"
+    )
+    min_inliers: int = Field(30, ge=8, description="matches that must agree on one motion")
+    min_inlier_ratio: float = Field(
+        0.5, ge=0, le=1, description="share of the matches that must agree"
+    )
+    min_spread: float = Field(
+        0.2, ge=0, le=1, description="share of the image's cells that inliers must reach"
+    )
+
+
+class PlacesConfig(Section):
+    """Keyframes that may show a place seen before, and their check."""
+
+    descriptor: str = Field("vlad", description="one of the names in laser_slam.places.DESCRIPTORS")
+    width: int = Field(640, ge=160, description="wider images are reduced before description, px")
+    num_features: int = Field(800, ge=50, description="features that a description sums up")
+    min_similarity: float = Field(
+        0.1, ge=-1, le=1, description="cosine, mean of the run removed, of a candidate at least"
+    )
+    min_contrast: float = Field(
+        3.0, ge=0, description="similarity above the run's median, in the run's standard deviations"
+    )
+    min_gap: float = Field(
+        5.0, gt=0, description="way between two visits of a place, in median depths"
+    )
+    suppression: float = Field(
+        0.5, ge=0, description="way at both ends within which the best pair stands for all, same"
+    )
+    max_per_keyframe: int = Field(3, ge=1, description="places that one keyframe may be")
+    max_per_window_pair: int = Field(2, ge=1, description="candidates between two windows")
+    verification: VerificationConfig = VerificationConfig()

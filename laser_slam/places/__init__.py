@@ -1,0 +1,46 @@
+"""Places: keyframes that may show what was seen before, and the check of the two images."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from laser_slam.errors import ConfigError
+from laser_slam.places.candidates import Candidate, CandidateSearch, Place
+from laser_slam.places.index import PlaceIndex
+from laser_slam.places.verification import Features, Verification, find_features, verify
+
+if TYPE_CHECKING:
+    from laser_slam.config import PlacesConfig
+    from laser_slam.places.base import Descriptor
+
+__all__ = [
+    "DESCRIPTORS",
+    "Candidate",
+    "CandidateSearch",
+    "Features",
+    "Place",
+    "PlaceIndex",
+    "Verification",
+    "find_features",
+    "make_descriptor",
+    "verify",
+]
+
+DESCRIPTORS = {"vlad": "laser_slam.places.vlad:VladDescriptor"}
+"""Name in the settings -> ``module:Class``, imported on use."""
+
+
+def make_descriptor(config: PlacesConfig) -> Descriptor:
+    """Import and build the descriptor that the settings name.
+
+    Raises:
+        ConfigError: no descriptor has this name.
+    """
+    if config.descriptor not in DESCRIPTORS:
+        raise ConfigError(
+            f"places.descriptor: no '{config.descriptor}'; there is {', '.join(DESCRIPTORS)}"
+        )
+    module, _, attribute = DESCRIPTORS[config.descriptor].partition(":")
+    descriptor: Descriptor = getattr(import_module(module), attribute)(config)
+    return descriptor

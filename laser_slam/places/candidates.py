@@ -1,0 +1,176 @@
+"""Which keyframes may show a place seen before: few pairs, each of another pair of places."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.config import PlacesConfig
+from laser_slam.places.index import PlaceIndex
+
+Array32 = NDArray[np.float32]
+
+BINS = 400  # of the histogram of similarities, over [-1, 1]
+MIN_SPREAD = 0.02  # of unlike places; less was only ever seen of few of them
+NORMAL_QUANTILE = 0.8413  # one standard deviation above the median
+
+
+@dataclass(frozen=True)
+class Place:
+    """A keyframe as place recognition sees it.
+
+    Attributes:
+        frame: index in the sequence.
+        window: that owns it.
+        travelled: way since the start, in median depths: each step divided by the median depth
+            of the scene there, so that a drifting unit of length makes no difference.
+    """
+
+    frame: int
+    window: int
+    travelled: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Two keyframes that may show one place.
+
+    Attributes:
+        older: the earlier visit.
+        newer: the later visit.
+        similarity: cosine of their descriptors, the mean of the run removed.
+        contrast: the same above the median of unlike pairs of the run, in their standard
+            deviations.
+    """
+
+    older: Place
+    newer: Place
+    similarity: float
+    contrast: float
+
+
+class Background:
+    """The similarities of all pairs compared so far: nearly all of them are of unlike places."""
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(BINS, np.int64)
+
+    def add(self, similarities: Array32) -> None:
+        """Count (N,) similarities in [-1, 1]."""
+        bins = np.clip((similarities + 1) * (BINS / 2), 0, BINS - 1).astype(np.int64)
+        self._counts += np.bincount(bins, minlength=BINS)
+
+    def contrast(self, similarities: Array32) -> Array32:
+        """Say how many standard deviations (N,) similarities lie above the median."""
+        shares = np.cumsum(self._counts) / max(1, self._counts.sum())
+        middles = (np.arange(BINS) + 0.5) * (2 / BINS) - 1
+        median, above = np.interp([0.5, NORMAL_QUANTILE], shares, middles)
+        return np.asarray((similarities - median) / max(above - median, MIN_SPREAD), np.float32)
+
+
+class CandidateSearch:
+    """Compare each keyframe with all those that were left behind, and propose the best pairs.
+
+    Memory: the descriptors, and about 200 bytes per keyframe.
+    """
+
+    def __init__(self, config: PlacesConfig, size: int) -> None:
+        """Start with no place, for descriptors of length ``size``."""
+        self._config = config
+        self._index = PlaceIndex(size)
+        self._background = Background()
+        self._places: list[Place] = []
+        self._travelled = np.zeros(0)
+        self._proposed: list[Candidate] = []
+
+    def add(self, places: Sequence[Place], descriptors: Array32) -> list[Candidate]:
+        """Look for earlier visits of the next keyframes, then remember them.
+
+        A pair that was proposed before stands for its neighbours for good: of the same two
+        stretches of road, one window's keyframes bring at most a few.
+
+        Args:
+            places: M keyframes, in order; those of one window, or as many as are at hand.
+            descriptors: (M, D) of unit length, or zeros.
+
+        Returns:
+            Pairs of old and new keyframes, most similar first.
+
+        Raises:
+            ValueError: the way travelled falls, or counts disagree.
+        """
+        if not len(places):
+            return []
+        travelled = np.array([place.travelled for place in places])
+        if len(descriptors) != len(places):
+            raise ValueError(f"{len(places)} places, {len(descriptors)} descriptors")
+        if (np.diff(np.concatenate([self._travelled[-1:], travelled])) < 0).any():
+            raise ValueError("the way travelled cannot fall")
+        hits = self._hits(places, descriptors) if len(self._places) else []
+        chosen = self._choose(sorted(hits, key=lambda hit: -hit.similarity))
+        self._index.insert(descriptors)
+        self._places += places
+        self._travelled = np.concatenate([self._travelled, travelled])
+        self._proposed = [hit for hit in [*self._proposed, *chosen] if self._is_near(hit, places)]
+        return chosen
+
+    def _is_near(self, hit: Candidate, places: Sequence[Place]) -> bool:
+        """Tell whether a pair may still stand for one of the keyframes that follow ``places``."""
+        last = places[-1]
+        way = last.travelled - hit.newer.travelled
+        return hit.newer.window == last.window or way <= self._config.suppression
+
+    def _hits(self, places: Sequence[Place], descriptors: Array32) -> list[Candidate]:
+        """Find, for each new keyframe, the places that it resembles more than chance has it."""
+        stops = [
+            int(np.searchsorted(self._travelled, place.travelled - self._config.min_gap, "right"))
+            for place in places
+        ]
+        found = self._index.similarities(descriptors, max(stops))
+        rows = [row[:stop] for row, stop in zip(found, stops, strict=True)]
+        for row in rows:
+            self._background.add(row)
+        return [
+            hit for place, row in zip(places, rows, strict=True) for hit in self._peaks(place, row)
+        ]
+
+    def _peaks(self, newer: Place, similarities: Array32) -> list[Candidate]:
+        """Return the best keyframe of each place that may be the one of ``newer``."""
+        contrast = self._background.contrast(similarities)
+        is_left = similarities >= self._config.min_similarity
+        is_left &= contrast >= self._config.min_contrast
+        peaks: list[Candidate] = []
+        while is_left.any() and len(peaks) < self._config.max_per_keyframe:
+            best = int(np.argmax(np.where(is_left, similarities, -np.inf)))
+            older = self._places[best]
+            peaks.append(Candidate(older, newer, float(similarities[best]), float(contrast[best])))
+            way = np.abs(self._travelled[: len(is_left)] - older.travelled)
+            is_left &= way > self._config.suppression
+        return peaks
+
+    def _choose(self, hits: Sequence[Candidate]) -> list[Candidate]:
+        """Take hits, best first, that no better one of the same two places stands for."""
+        taken = list(self._proposed)
+        counts = Counter((hit.older.window, hit.newer.window) for hit in taken)
+        chosen = []
+        for hit in hits:
+            windows = (hit.older.window, hit.newer.window)
+            if counts[windows] < self._config.max_per_window_pair and not any(
+                self._is_same(hit, other) for other in taken
+            ):
+                counts[windows] += 1
+                taken.append(hit)
+                chosen.append(hit)
+        return chosen
+
+    def _is_same(self, first: Candidate, second: Candidate) -> bool:
+        """Tell whether two pairs are of the same two places: near each other at *both* ends."""
+        radius = self._config.suppression
+        return (
+            abs(first.older.travelled - second.older.travelled) <= radius
+            and abs(first.newer.travelled - second.newer.travelled) <= radius
+        )
