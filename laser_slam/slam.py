@@ -245,6 +245,8 @@ class Slam:
         reason = _unregistrable(last, placed)
         if reason is None:
             try:
+                if self._config.layers.feed_back:
+                    last = self.corrected(last)
                 return register(last, placed, self._config.registration)
             except DegenerateGeometryError as error:
                 reason = str(error)

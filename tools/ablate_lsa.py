@@ -69,6 +69,8 @@ ROWS = {
     "w/o memory": Row(None, (ON, "layers.memory=0")),
     "w/o feathering": Row(None, (ON, "layers.feather=0")),
     "full resolution": Row(None, (ON, "layers.segmentation.downscale=1")),
+    "with feedback": Row(None, (ON, "layers.feed_back=true")),
+    "label files": Row(None, (ON, "layers.segmentation.segmenter=label_files")),
     "paper w/o LSA": Row("paper", ("layers.enabled=never",)),
     "paper w/o intra": Row("paper", (ON, "layers.intra=false")),
     "L 10": Row(None, (ON, "windows.size=10")),
@@ -76,7 +78,8 @@ ROWS = {
     "O 2": Row(None, (ON, "windows.overlap=2")),
     "O 10": Row(None, (ON, "windows.overlap=10")),
 }
-DEFAULT_ROWS = ",".join(list(ROWS)[:17])
+NEED_MORE = ("label files",)  # with --set layers.segmentation.label_folder=DIR
+DEFAULT_ROWS = ",".join(name for name in ROWS if name not in NEED_MORE)
 
 
 class Result(NamedTuple):
