@@ -18,6 +18,28 @@ def count_pairs(first, second, num_first, num_second):
 
 
 @njit(cache=True, nogil=True)
+def overlaps(shared, tau):
+    """Return which labels' intersection over union exceeds ``tau``: (E,) each, and (E,) it.
+
+    Args:
+        shared: (M + 1, N + 1) pixels of each pair of labels; 0 is no label, and no union.
+        tau: IoU.
+    """
+    first, second = shared[1:, 1:].sum(axis=1), shared[1:, 1:].sum(axis=0)
+    rows, columns = np.nonzero(shared[1:, 1:])
+    iou = np.empty(rows.size, np.float64)
+    num = 0
+    for e in range(rows.size):
+        m, n = rows[e], columns[e]
+        both = shared[m + 1, n + 1]
+        share = both / (first[m] + second[n] - both)
+        if share > tau:
+            rows[num], columns[num], iou[num] = m, n, share
+            num += 1
+    return rows[:num], columns[:num], iou[:num]
+
+
+@njit(cache=True, nogil=True)
 def carry_labels(labels, there, here, pixel_there_from_here, block):
     """Return the (h, w) labels that another frame gives to what this frame's cells show.
 
@@ -32,19 +54,34 @@ def carry_labels(labels, there, here, pixel_there_from_here, block):
     """
     height, width = labels.shape
     out = np.zeros((height, width), labels.dtype)
-    M = pixel_there_from_here
+    depth, at = np.empty(width), np.empty(width, np.int32)
     for v in range(height):
+        _project_row(here[v], v, pixel_there_from_here, (height, width, block), depth, at)
         for u in range(width):
-            z = here[v, u]
-            if not z > 0:
-                continue
-            x, y = z * u * block, z * v * block
-            depth = M[2, 0] * x + M[2, 1] * y + M[2, 2] * z + M[2, 3]
-            if not depth > 0:
-                continue
-            column = (M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3]) / depth / block + 0.5
-            row = (M[1, 0] * x + M[1, 1] * y + M[1, 2] * z + M[1, 3]) / depth / block + 0.5
-            if 0 <= row < height and 0 <= column < width:  # int() alone rounds towards zero
-                if abs(there[int(row), int(column)] - depth) < 0.15 * depth:
-                    out[v, u] = labels[int(row), int(column)]
+            if at[u] >= 0:
+                row = at[u] // width
+                column = at[u] - row * width
+                if abs(there[row, column] - depth[u]) < 0.15 * depth[u]:
+                    out[v, u] = labels[row, column]
     return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _project_row(here, v, M, shape, depth, at):
+    """Fill (w,) depth in the other frame and which of its cells a row's cells fall on; -1: none.
+
+    Without branches, so that several cells are done at once.
+    """
+    height, width, block = shape
+    a, b, c = M[:, 1] * (v * block) + M[:, 2]
+    for u in range(here.size):
+        z, x = np.float64(here[u]), np.float64(u * block)
+        far = (M[2, 0] * x + c) * z + M[2, 3]
+        per_cell = 1.0 / (far * block)
+        column = ((M[0, 0] * x + a) * z + M[0, 3]) * per_cell + 0.5
+        row = ((M[1, 0] * x + b) * z + M[1, 3]) * per_cell + 0.5
+        inside = (z > 0) & (far > 0) & (row >= 0) & (row < height)
+        inside &= (column >= 0) & (column < width)  # int() alone rounds towards zero
+        row, column = row if inside else 0.0, column if inside else 0.0
+        depth[u] = far
+        at[u] = np.int32(row) * width + np.int32(column) if inside else -1

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.layers.alignment_kernels import carry_labels, count_pairs
+from laser_slam.layers.alignment_kernels import carry_labels, count_pairs, overlaps
 from laser_slam.types import Prediction
 
 Indices = NDArray[np.int64]
@@ -75,24 +76,23 @@ def intra_window_edges(
             the same pixels are compared, as if the camera stood still.
         block: pixels that a label's cell has a side.
     """
-    found = []
-    for i in range(1, len(labels)):
-        before = labels[i - 1] if window is None else _carried(labels[i - 1], window, i, block)
-        found.append(_edges((before, starts[i - 1]), (labels[i], starts[i]), tau, i))
+    carried = labels[:-1] if window is None else _carried(labels, window, block)
+    found = [
+        _edges((before, starts[i]), (labels[i + 1], starts[i + 1]), tau, i + 1)
+        for i, before in enumerate(carried)
+    ]
     return _joined(found)
 
 
-def _carried(before: Labels, window: Prediction, frame: int, block: int) -> Labels:
-    """Return the labels of the frame before as this frame's cells see them."""
-    K = window.intrinsics
-    before_from_here = (
-        np.linalg.inv(window.window_from_cam[frame - 1]) @ window.window_from_cam[frame]
-    )
-    pixel_there_from_here = K[frame - 1] @ before_from_here[:3]
-    pixel_there_from_here[:, :3] = pixel_there_from_here[:, :3] @ np.linalg.inv(K[frame])
-    there, here = (window.depth[i, ::block, ::block] for i in (frame - 1, frame))
-    out: Labels = carry_labels(before, there, here, pixel_there_from_here, block)
-    return out
+def _carried(labels: Labels, window: Prediction, block: int) -> Iterator[Labels]:
+    """Yield the labels of each frame but the last as the cells of the next frame see them."""
+    K, window_from_cam = window.intrinsics, window.window_from_cam
+    before_from_here = np.linalg.inv(window_from_cam[:-1]) @ window_from_cam[1:]
+    pixel_there_from_here = K[:-1] @ before_from_here[:, :3]
+    pixel_there_from_here[..., :3] = pixel_there_from_here[..., :3] @ np.linalg.inv(K[1:])
+    depth = window.depth[:, ::block, ::block]
+    for i, M in enumerate(pixel_there_from_here):
+        yield carry_labels(labels[i], depth[i], depth[i + 1], M, block)
 
 
 def _edges(
@@ -100,11 +100,9 @@ def _edges(
 ) -> Edges:
     (labels_a, first_a), (labels_b, first_b) = parents, children
     # Whatever is unknown in either image says nothing of the overlap of two layers.
-    shared = count_pairs(labels_a, labels_b, int(labels_a.max()), int(labels_b.max()))[1:, 1:]
-    union = shared.sum(axis=1)[:, None] + shared.sum(axis=0)[None] - shared
-    iou = shared / np.maximum(union, 1)
-    m, n = np.nonzero(iou > tau)
-    return Edges(m + first_a, n + first_b, iou[m, n], np.full(len(m), frame))
+    shared = count_pairs(labels_a, labels_b, int(labels_a.max()), int(labels_b.max()))
+    m, n, iou = overlaps(shared, tau)
+    return Edges(m + first_a, n + first_b, iou, np.full(len(m), frame))
 
 
 def _joined(parts: list[Edges]) -> Edges:
