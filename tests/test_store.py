@@ -11,14 +11,17 @@ import pytest
 from laser_slam.config import load_config
 from laser_slam.errors import RunFolderError
 from laser_slam.store import (
+    WindowFiles,
     atomic_write,
     link_latest,
+    load_layers,
     load_prediction,
     new_run_folder,
     open_run_folder,
+    save_layers,
     save_prediction,
 )
-from laser_slam.types import Image, Prediction, WindowStatus
+from laser_slam.types import Image, Layers, Prediction, WindowStatus
 
 HEIGHT, WIDTH = 192, 640
 
@@ -124,6 +127,112 @@ def test_a_file_of_another_version_is_refused(tmp_path: Path) -> None:
     np.savez(path, allow_pickle=False, **{**arrays, "version": np.array(99)})
     with pytest.raises(RunFolderError, match="has format 99"):
         load_prediction(path)
+
+
+def some_layers(seed: int = 0, num_knots: int = 9) -> Layers:
+    """Three frames with 4, 0 and 300 layers: more than a byte counts."""
+    rng = np.random.default_rng(seed)
+    labels = np.zeros((3, HEIGHT // 2, WIDTH // 2), np.uint16)
+    labels[0] = rng.integers(0, 5, labels.shape[1:])
+    labels[2].flat[: 300 * 40] = np.repeat(np.arange(1, 301), 40)
+    starts = np.array([0, 4, 4, 304])
+    depths = np.geomspace(0.3, 8, num_knots)
+    return Layers(
+        labels,
+        starts,
+        rng.lognormal(0, 0.1, 304),
+        rng.integers(1, 9, 304).astype(float),
+        np.stack([depths, rng.lognormal(0, 0.1, num_knots)], axis=1),
+    )
+
+
+@pytest.mark.parametrize("num_knots", [0, 9])
+def test_layers_survive_the_round_trip_to_the_last_bit(tmp_path: Path, num_knots: int) -> None:
+    written = some_layers(num_knots=num_knots)
+    save_layers(tmp_path / "0.npz", written)
+    read = load_layers(tmp_path / "0.npz")
+    for name, values in vars(written).items():
+        assert np.array_equal(getattr(read, name), values)
+        assert getattr(read, name).dtype == values.dtype
+
+
+def test_layers_take_little_beside_the_depth(tmp_path: Path) -> None:
+    y, x = np.mgrid[: HEIGHT // 2, : WIDTH // 2]
+    labels = np.tile(1 + x // 16 + 20 * (y // 16), (3, 1, 1)).astype(np.uint16)
+    num = int(labels.max())
+    starts = num * np.arange(4)
+    scales = np.random.default_rng(0).lognormal(0, 0.1, 3 * num)
+    save_layers(tmp_path / "0.npz", Layers(labels, starts, scales, scales, np.empty((0, 2))))
+    assert (tmp_path / "0.npz").stat().st_size / 3 < 20_000
+
+
+@pytest.mark.parametrize("place", [0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.999])
+@pytest.mark.parametrize("damage", ["cut", "bits"])
+def test_damaged_layers_are_named_with_what_to_do(
+    tmp_path: Path, damage: str, place: float
+) -> None:
+    path = tmp_path / "000007.npz"
+    save_layers(path, some_layers())
+    data = bytearray(path.read_bytes())
+    at = int(place * len(data))
+    if damage == "cut":
+        path.write_bytes(data[:at])
+    else:
+        data[at - 3 : at + 3] = bytes(255 - byte for byte in data[at - 3 : at + 3])
+        path.write_bytes(data)
+    with pytest.raises(RunFolderError, match=r"000007\.npz.*delete it and run again"):
+        load_layers(path)
+
+
+def test_no_single_byte_makes_layers_wrong_without_a_word(tmp_path: Path) -> None:
+    path = tmp_path / "0.npz"
+    ones = np.ones(2)
+    written = Layers(np.ones((2, 8, 8), np.uint16), np.arange(3), ones, ones, np.empty((0, 2)))
+    save_layers(path, written)
+    whole, num_refused = path.read_bytes(), 0
+    for at in range(0, len(whole), 7):
+        path.write_bytes(whole[:at] + bytes([255 - whole[at]]) + whole[at + 1 :])
+        try:
+            read = load_layers(path)
+        except RunFolderError:
+            num_refused += 1
+        else:  # a byte that says nothing, such as a date
+            assert all(np.array_equal(getattr(read, n), v) for n, v in vars(written).items())
+    assert num_refused > len(whole) / 7 / 2
+
+
+def test_layers_of_another_version_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "0.npz"
+    save_layers(path, some_layers())
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, allow_pickle=False, **{**arrays, "version": np.array(99)})
+    with pytest.raises(RunFolderError, match="has format 99"):
+        load_layers(path)
+
+
+def test_a_windows_files_are_told_by_its_index(tmp_path: Path) -> None:
+    open_run_folder(tmp_path, CONFIG, SEQUENCE)
+    files = WindowFiles(tmp_path)
+    for index in (0, 12):
+        assert not files.has(index)
+        files.save(index, a_prediction(seed=index), a_street())
+        files.save_layers(index, some_layers(index))
+        assert files.has(index)
+    assert (tmp_path / "windows" / "000012.npz").exists()
+    assert (tmp_path / "layers" / "000012.npz").exists()
+    for index in (0, 12):
+        assert np.array_equal(files.load_layers(index).scales, some_layers(index).scales)
+        prediction, _ = files.load(index)
+        assert np.array_equal(prediction.window_from_cam, a_prediction(seed=index).window_from_cam)
+        depth_alone = files.load_depth(index)
+        for name in ("depth", "confidence", "window_from_cam", "intrinsics", "frames"):
+            alone, whole = getattr(depth_alone, name), getattr(prediction, name)
+            assert np.array_equal(alone, whole, equal_nan=True)
+    with pytest.raises(RunFolderError, match=r"000005\.npz.*delete it and run again"):
+        files.load_layers(5)
+    with pytest.raises(RunFolderError, match="holds other frames than window 12"):
+        files.load(12, np.arange(3))
 
 
 def test_a_written_file_replaces_the_old_one(tmp_path: Path) -> None:

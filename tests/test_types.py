@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from laser_slam.types import Prediction, Trajectory, WindowStatus
+from laser_slam.types import Layers, Prediction, Trajectory, WindowStatus
 
 
 def parts(num: int = 2) -> dict[str, Any]:
@@ -81,3 +81,44 @@ def test_a_trajectory_is_finite() -> None:
     poses[1, 0, 3] = np.nan
     with pytest.raises(ValueError, match="finite"):
         Trajectory(np.arange(3), np.arange(3) / 10, poses)
+
+
+def layers_with(**changes: Any) -> Layers:
+    """Two frames, with two layers and with one."""
+    labels = np.zeros((2, 3, 4), np.uint16)
+    labels[0, 0], labels[0, 1], labels[1, 2] = 1, 2, 1
+    sound = {
+        "labels": labels,
+        "starts": np.array([0, 2, 3]),
+        "scales": np.array([1.0, 0.9, 1.1]),
+        "witnesses": np.ones(3),
+        "curve": np.array([[1.0, 1.1], [2.0, 0.9]]),
+    }
+    return Layers(**{**sound, **changes})
+
+
+def test_sound_layers_are_made_with_a_curve_or_without() -> None:
+    assert len(layers_with().curve) == 2
+    assert len(layers_with(curve=np.empty((0, 2))).curve) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("labels", np.zeros((3, 4), np.uint16), "labels"),
+        ("starts", np.array([0, 3]), "starts"),
+        ("starts", np.array([0, 2, 4]), "3 scales"),
+        ("starts", np.array([1, 2, 3]), "3 scales"),
+        ("scales", np.array([1.0, 0.9]), "2 scales"),
+        ("witnesses", np.ones(2), "3 scales"),
+        ("curve", np.ones(4), "a curve must be"),
+        ("curve", np.ones((2, 3)), "a curve must be"),
+        ("scales", np.array([1.0, 0.0, 1.0]), "positive and finite"),
+        ("scales", np.array([1.0, np.nan, 1.0]), "positive and finite"),
+        ("scales", np.array([1.0, np.inf, 1.0]), "positive and finite"),
+        ("curve", np.array([[1.0, -1.0]]), "positive and finite"),
+    ],
+)
+def test_unsound_layers_are_refused(name: str, value: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        layers_with(**{name: value})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
@@ -20,6 +21,8 @@ from laser_slam.types import Image, Layers, Prediction, WindowStatus
 
 FORMAT_VERSION = 1
 JPEG_QUALITY = 85
+# What a damaged archive makes its reader raise; RuntimeError: for flags that zipfile knows not.
+_DAMAGE = (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 
 def save_prediction(path: Path, prediction: Prediction, colors: Image) -> Prediction:
@@ -154,7 +157,7 @@ def _reading(path: Path) -> Iterator[None]:
     """Say of what is wrong with a file that it is this file, and what to do."""
     try:
         yield
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except _DAMAGE as error:
         text = " ".join(str(error).split()) or type(error).__name__
         raise RunFolderError(
             f"cannot read window file {path}: {text}; delete it and run again"
