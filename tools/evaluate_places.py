@@ -270,10 +270,11 @@ def _truth_of_poses(
     distance = np.linalg.norm(centres[:, None] - centres, axis=2)
     cosine = (np.einsum("iab,jab->ij", rotations, rotations) - 1) / 2
     turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    steps: Array = np.linalg.norm(np.diff(centres, axis=0), axis=1) / median_depth
+    steps = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
+    travelled = np.asarray(np.cumsum(steps) / median_depth, np.float64)
     right = (distance < limits[0]) & (turn < limits[1])
     wrong = (distance > WRONG * limits[0]) | (turn > WRONG * limits[1])
-    return Truth(right, wrong, np.concatenate([np.zeros(1), np.cumsum(steps)]))
+    return Truth(right, wrong, travelled)
 
 
 def _truth_of_ranges(frames: NDArray[np.int64], same: str, step: float) -> Truth:

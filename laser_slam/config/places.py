@@ -18,12 +18,12 @@ class VerificationConfig(Section):
     max_error_px: float = Field(
         1.0, gt=0, description="distance from the epipolar line of an inlier, px at this width"
     )
-    min_inliers: int = Field(30, ge=8, description="matches that must agree on one motion")
+    min_inliers: int = Field(40, ge=8, description="matches that must agree on one motion")
     min_inlier_ratio: float = Field(
         0.5, ge=0, le=1, description="share of the matches that must agree"
     )
     min_spread: float = Field(
-        0.2, ge=0, le=1, description="share of the image's cells that inliers must reach"
+        0.25, ge=0, le=1, description="share of the image's cells that inliers must reach"
     )
 
 
@@ -34,10 +34,10 @@ class PlacesConfig(Section):
     width: int = Field(640, ge=160, description="wider images are reduced before description, px")
     num_features: int = Field(800, ge=50, description="features that a description sums up")
     min_similarity: float = Field(
-        0.1, ge=-1, le=1, description="cosine, mean of the run removed, of a candidate at least"
+        0.05, ge=-1, le=1, description="cosine, mean of the run removed, of a candidate at least"
     )
     min_contrast: float = Field(
-        3.0, ge=0, description="similarity above the run's median, in the run's standard deviations"
+        4.0, ge=0, description="similarity above the run's median, in the run's standard deviations"
     )
     min_gap: float = Field(
         5.0, gt=0, description="way between two visits of a place, in median depths"
@@ -47,4 +47,5 @@ class PlacesConfig(Section):
     )
     max_per_keyframe: int = Field(3, ge=1, description="places that one keyframe may be")
     max_per_window_pair: int = Field(2, ge=1, description="candidates between two windows")
+    max_per_window: int = Field(6, ge=1, description="candidates of one window: bounds the time")
     verification: VerificationConfig = VerificationConfig()

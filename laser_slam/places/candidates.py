@@ -155,14 +155,16 @@ class CandidateSearch:
     def _choose(self, hits: Sequence[Candidate]) -> list[Candidate]:
         """Take hits, best first, that no better one of the same two places stands for."""
         taken = list(self._proposed)
-        counts = Counter((hit.older.window, hit.newer.window) for hit in taken)
+        pairs = Counter((hit.older.window, hit.newer.window) for hit in taken)
+        singles = Counter(hit.newer.window for hit in taken)
         chosen = []
         for hit in hits:
             windows = (hit.older.window, hit.newer.window)
-            if counts[windows] < self._config.max_per_window_pair and not any(
-                self._is_same(hit, other) for other in taken
-            ):
-                counts[windows] += 1
+            is_full = pairs[windows] >= self._config.max_per_window_pair
+            is_full |= singles[hit.newer.window] >= self._config.max_per_window
+            if not (is_full or any(self._is_same(hit, other) for other in taken)):
+                pairs[windows] += 1
+                singles[hit.newer.window] += 1
                 taken.append(hit)
                 chosen.append(hit)
         return chosen
