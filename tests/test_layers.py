@@ -651,14 +651,26 @@ def test_slam_leaves_layers_alone_where_they_are_switched_off() -> None:
         assert np.array_equal(given.depth, got.depth)
 
 
-def test_layers_never_move_a_camera() -> None:
+def bent_windows() -> list[Prediction]:
+    """Bend depth smoothly, differently in each window."""
+    windows = corridor_windows()
+    for k, window in enumerate(windows):
+        log_depth = np.log(window.depth / np.median(window.depth))
+        window.depth[:] *= np.exp(0.12 * np.sin(1.5 * log_depth + 2.0 * k))
+    return windows
+
+
+def test_layers_move_cameras_only_where_they_are_told_to_feed_back() -> None:
     never = load_config(assignments=["layers.enabled=never"])
+    feeding = load_config(assignments=["layers.enabled=always", "layers.feed_back=true"])
     times = np.arange(99.0)
-    with_layers, _ = run_slam(corridor_windows())
-    without, _ = run_slam(corridor_windows(), never)
-    assert np.array_equal(
-        with_layers.trajectory(times).world_from_cam, without.trajectory(times).world_from_cam
-    )
+    paths = [
+        run_slam(bent_windows(), config)[0].trajectory(times).world_from_cam
+        for config in (never, ALWAYS, feeding)
+    ]
+    assert np.array_equal(paths[0], paths[1])
+    assert not np.allclose(paths[0], paths[2], atol=1e-4)
+    assert np.isfinite(paths[2]).all()
 
 
 def test_true_windows_of_the_corridor_stay_true_through_slam() -> None:
