@@ -1,5 +1,6 @@
 """Every setting, and how settings are read."""
 
+from laser_slam.config.closures import ClosuresConfig
 from laser_slam.config.loading import dump_config, load_config, setting_names, shipped_configs
 from laser_slam.config.places import PlacesConfig, VerificationConfig
 from laser_slam.config.sections import (
@@ -23,6 +24,7 @@ __all__ = [
     "BackboneConfig",
     "CalibrationConfig",
     "ClassicalConfig",
+    "ClosuresConfig",
     "Config",
     "DatasetConfig",
     "FusionConfig",

@@ -6,6 +6,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from laser_slam.config.closures import ClosuresConfig
 from laser_slam.config.places import PlacesConfig
 from laser_slam.config.section import Section as _Section
 from laser_slam.config.simulated import SimulatedConfig
@@ -250,6 +251,7 @@ class Config(_Section):
     registration: RegistrationConfig = RegistrationConfig()
     layers: LayersConfig = LayersConfig()
     places: PlacesConfig = PlacesConfig()
+    closures: ClosuresConfig = ClosuresConfig()
     pose_graph: PoseGraphConfig = PoseGraphConfig()
     fusion: FusionConfig = FusionConfig()
     synthetic: SyntheticConfig = SyntheticConfig()

@@ -1,0 +1,1 @@
+"""Closures: a candidate measured and judged, and one record of it."""
