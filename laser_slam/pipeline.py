@@ -225,9 +225,9 @@ class Pipeline:
     def _submaps(self) -> Iterator[Submap]:
         """Read the stored windows back, one at a time, at their final places."""
         nodes = self._slam.nodes
-        for node in nodes:
+        for node, places in zip(nodes, self._slam.frame_places(), strict=True):
             window = self._load(node.index)
-            yield node.submap(window.corrected, window.colors)
+            yield node.submap(window.corrected, window.colors, places)
             self._on_progress("fusing", node.index + 1, len(nodes))
 
     def _fuse(self) -> Cloud:

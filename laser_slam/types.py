@@ -239,6 +239,8 @@ class Submap:
         world_from_window: its Sim(3) node.
         is_owned: (N,) True where this window gives the frame to trajectory and map.
         registration: to the window before; None for the first.
+        places: ``world_from_window`` of each frame, which differ where closures have bent the
+            chain of windows; empty: ``world_from_window`` for all.
     """
 
     index: int
@@ -247,6 +249,7 @@ class Submap:
     world_from_window: Sim3
     is_owned: NDArray[np.bool_]
     registration: Registration | None
+    places: tuple[Sim3, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -52,19 +52,20 @@ def _median_depth(submap: Submap, config: FusionConfig) -> float | None:
 
 
 def _owned_views(submap: Submap, median: float, config: FusionConfig) -> Iterator[View]:
-    prediction, world_from_window = submap.prediction, submap.world_from_window
-    world_from_cam = world_from_window.apply_poses(prediction.window_from_cam)
+    prediction = submap.prediction
     for i in np.flatnonzero(submap.is_owned):
         depth, confidence = prediction.depth[i], prediction.confidence[i]
         near = (depth > 0) & (depth <= config.max_range * median)
         usable = near & (confidence >= config.min_confidence)
+        place = submap.places[i] if submap.places else submap.world_from_window
+        world_from_cam = place.apply_poses(prediction.window_from_cam[i])
         cam_from_pixel = np.linalg.inv(prediction.intrinsics[i])
         yield View(
             depth=np.ascontiguousarray(depth, np.float32),
             weight=np.where(usable, confidence, 0).astype(np.float32),
             color=np.ascontiguousarray(submap.colors[i]),
-            world_from_ray=world_from_window.scale * world_from_cam[i, :3, :3] @ cam_from_pixel,
-            center=world_from_cam[i, :3, 3].copy(),
+            world_from_ray=place.scale * world_from_cam[:3, :3] @ cam_from_pixel,
+            center=world_from_cam[:3, 3].copy(),
         )
 
 

@@ -86,6 +86,9 @@ class PoseGraph:
         self._rows: dict[int, int] = {}  # by index of window, in the order of addition
         self._chain_rows: list[tuple[int, int]] = []
 
+    def __len__(self) -> int:
+        return len(self._rows)
+
     @property
     def places(self) -> dict[int, Sim3]:
         """Return ``world_from_window`` by index, in the order in which windows were added."""

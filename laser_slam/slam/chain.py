@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,10 @@ from laser_slam.layers import (
     make_segmenter,
     smooth_layers,
 )
+from laser_slam.pose_graph import Optimised, PoseGraph, spread_corrections, spread_poses
 from laser_slam.registration import bridge, register
 from laser_slam.sim3 import Sim3, complete_poses
+from laser_slam.slam.node import Node
 from laser_slam.store import WindowFiles
 from laser_slam.types import (
     Image,
@@ -45,55 +47,6 @@ def no_clock(_name: str) -> AbstractContextManager[None]:
     return nullcontext()
 
 
-@dataclass(frozen=True)
-class Node:
-    """A window's place in the world: what is kept of a submap once its depth is on disk.
-
-    Attributes:
-        index: of its window.
-        frames: (N,) rising indices in the sequence.
-        window_from_cam: (N, 4, 4) rigid, in window units.
-        world_from_window: Sim(3); world units are the units of the first window.
-        owned: first frame that this window owns, and the first that it no longer does.
-        registration: to the window before; None for the first.
-        layers: what became of its layers; None: they were not looked at.
-    """
-
-    index: int
-    frames: NDArray[np.int64]
-    window_from_cam: Array
-    world_from_window: Sim3
-    owned: tuple[int, int]
-    registration: Registration | None
-    layers: LayerCounts | None = None
-
-    @property
-    def is_owned(self) -> NDArray[np.bool_]:
-        """Return (N,) True where this window gives the frame to trajectory and map."""
-        return (self.frames >= self.owned[0]) & (self.frames < self.owned[1])
-
-    @property
-    def measured_scale(self) -> float | None:
-        """Return the scale that maps this window's unit to the last one's; None: unmeasured."""
-        registration = self.registration
-        if registration is None or registration.bridged:
-            return None
-        return registration.previous_from_current.scale
-
-    def submap(self, prediction: Prediction, colors: Image) -> Submap:
-        """Join the node with its window's prediction, layers applied, from disk perhaps."""
-        if prediction.status is WindowStatus.FAILED:  # its own poses mean nothing
-            prediction = replace(prediction, window_from_cam=self.window_from_cam)
-        return Submap(
-            self.index,
-            prediction,
-            colors,
-            self.world_from_window,
-            self.is_owned,
-            self.registration,
-        )
-
-
 class Slam:
     """Chain windows into one world; memory grows by a few kilobytes per window.
 
@@ -102,6 +55,7 @@ class Slam:
     Attributes:
         nodes: the places of all windows so far, in order.
         layers: of the window added last; None: they are not looked at.
+        optimised: what the last closure has brought; None: there is none.
     """
 
     def __init__(self, config: Config, stage: Stage = no_clock) -> None:
@@ -117,6 +71,8 @@ class Slam:
         self._segmenter: Segmenter | None = None
         if config.has_layers:
             self._segmenter = make_segmenter(config.layers.segmentation)
+        self._graph: PoseGraph | None = None
+        self.optimised: Optimised | None = None
         self.nodes: list[Node] = []
         self.layers: Layers | None = None
 
@@ -185,6 +141,48 @@ class Slam:
         """Count the keyframes of all windows, each once."""
         return sum(int(node.is_owned.sum()) for node in self.nodes)
 
+    def close(self, a: int, b: int, a_from_b: Sim3, sigmas: Array) -> bool:
+        """Close a loop: windows move to where chain and closures agree best.
+
+        Args:
+            a: index of a window.
+            b: index of another that saw the same place.
+            a_from_b: measured.
+            sigmas: (7,) as in ``Registration.sigmas``, a being the previous window.
+
+        Returns:
+            Whether the graph trusts it; an earlier closure may lose its trust by it.
+
+        Raises:
+            DegenerateGeometryError: a sigma is not positive and finite.
+        """
+        with self._stage("optimise"):
+            graph = self.pose_graph()
+            graph.add_closure(a, b, a_from_b, sigmas)
+            self.optimised = graph.optimise()
+            places = self.optimised.world_from_window
+            self.nodes = [
+                replace(node, world_from_window=places[node.index]) for node in self.nodes
+            ]
+        return bool(self.optimised.is_trusted[-1])
+
+    def pose_graph(self) -> PoseGraph:
+        """Return the graph of all windows so far, with the closures in it."""
+        if self._graph is None:
+            self._graph = PoseGraph(self._config.pose_graph)
+        for node in self.nodes[len(self._graph) :]:
+            self._graph.add_window(node.index, node.world_from_window)
+            if node.registration is not None:
+                self._graph.add_registration(node.index - 1, node.index, node.registration)
+        return self._graph
+
+    def frame_places(self) -> list[list[Sim3]]:
+        """Return ``world_from_window`` of each frame that each window owns.
+
+        What closures have moved is spread over the frames: none jumps at a window's border.
+        """
+        return spread_corrections([node.moved for node in self.nodes])
+
     def trajectory(self, times_s: Array) -> Trajectory:
         """Return the pose of every keyframe, each from the window that owns it.
 
@@ -194,13 +192,9 @@ class Slam:
         Returns:
             ``world_from_cam`` of the keyframes, in world units.
         """
-        frames = [node.frames[node.is_owned] for node in self.nodes]
-        poses = [
-            node.world_from_window.apply_poses(node.window_from_cam[node.is_owned])
-            for node in self.nodes
-        ]
-        owned = np.concatenate(frames)
-        return Trajectory(owned, times_s[owned], np.concatenate(poses))
+        owned = np.concatenate([node.frames[node.is_owned] for node in self.nodes])
+        world_from_cam = spread_poses([node.moved for node in self.nodes])
+        return Trajectory(owned, times_s[owned], world_from_cam)
 
     def _align_layers(self, placed: Prediction, colors: Image) -> None:
         if self._segmenter is None:
@@ -220,11 +214,17 @@ class Slam:
     ) -> None:
         start = self.nodes[-1].owned[1] if self.nodes else int(placed.frames[0])
         end = int(placed.frames[-1]) + 1
+        # The chain goes on from where closures have moved it, by the same correction.
+        chained = world_from_window
+        if self.nodes:
+            last = self.nodes[-1]
+            chained = last.chained @ last.world_from_window.inverse() @ world_from_window
         self.nodes.append(
             Node(
                 len(self.nodes),
                 placed.frames,
                 placed.window_from_cam,
+                chained,
                 world_from_window,
                 (start, max(start, end)),
                 registration,
