@@ -18,6 +18,7 @@ Indices = NDArray[np.int64]
 _MIN_FRAMES = 2  # that must agree, where there are as many
 _OUTLIER = 3.0  # noise sigmas from the median of the frames
 _FEW_FRAMES = 1.2  # the median of few frames lies too close to them
+_TWO_FRAMES = 2.1  # sigmas in the median distance from the mean of two frames
 _NOISE_UNSEEN = 0.05  # log-ratio, where no track has frames enough to show its noise
 _LEAST_NOISE = 2e-3
 _NOISE_SUPPORT = 60.0  # cells with which a layer's own noise counts as much as what all share
@@ -70,9 +71,7 @@ def join_frames(pieces: Pieces, track: Indices, gain: Array) -> Observations:
     wanted = gain * pieces.log_ratio
     num = np.bincount(of)
     error = np.abs(wanted - _group_median(wanted, of)[of])
-    again = num[of] >= 3
-    noise = _FEW_FRAMES * 1.4826 * float(np.median(error[again])) if again.any() else _NOISE_UNSEEN
-    noise = max(noise, _LEAST_NOISE)
+    noise = max(_noise(error, num[of]), _LEAST_NOISE)
     kept = error <= _OUTLIER * noise
     frames = np.bincount(of, kept)
     cells = np.bincount(of, kept * pieces.support)
@@ -86,6 +85,19 @@ def join_frames(pieces: Pieces, track: Indices, gain: Array) -> Observations:
         log_depth=np.bincount(of, weight * pieces.log_depth)[seen] / cells,
         place=pieces.place[first][seen],
     )
+
+
+def _noise(error: Array, num: Indices) -> float:
+    """Estimate the standard deviation of one frame's ratio from (G,) distances to the median.
+
+    Args:
+        error: absolute.
+        num: (G,) frames in the group of each.
+    """
+    for enough, factor in ((num >= 3, _FEW_FRAMES * 1.4826), (num == 2, _TWO_FRAMES)):
+        if enough.any():
+            return factor * float(np.median(error[enough]))
+    return _NOISE_UNSEEN
 
 
 def _is_best(group: Indices, value: Array) -> NDArray[np.bool_]:
