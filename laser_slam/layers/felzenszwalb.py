@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from laser_slam.config import SegmentationConfig
 from laser_slam.layers import felzenszwalb_kernels as kernels
+from laser_slam.layers.edge_kernels import NUM_DIRECTIONS, weigh_edges
 from laser_slam.layers.merging import merge_regions
 from laser_slam.layers.segmenters import MAX_LAYERS, close_gaps
 from laser_slam.types import Image, Prediction
@@ -30,9 +31,9 @@ class Workspace:
     def __init__(self, height: int, width: int) -> None:
         num = height * width
         self.size = (height, width)
-        self.weights = np.empty((kernels.NUM_DIRECTIONS, height, width), np.float32)
-        self.spare = np.empty(kernels.NUM_DIRECTIONS * num, np.uint64)
-        self.edges = np.empty(kernels.NUM_DIRECTIONS * num, np.uint64)
+        self.weights = np.empty((NUM_DIRECTIONS, height, width), np.float32)
+        self.spare = np.empty(NUM_DIRECTIONS * num, np.uint64)
+        self.edges = np.empty(NUM_DIRECTIONS * num, np.uint64)
         self.parents = np.empty(num, np.uint32)
         self.sizes = np.empty(num, np.uint32)
         self.limits = np.empty(num, np.float64)
@@ -65,11 +66,12 @@ def partition(
     """
     work = workspace or Workspace(*image.shape)
     blurred = blur(image, sigma)
-    kernels.weigh_edges(blurred, work.weights)
-    num, base = kernels.sort_edges(work.weights, work.spare, work.edges)
-    edges, forest = work.edges[:num], (work.parents, work.sizes)
-    refused = kernels.join_by_weight(edges, base, work.offsets, scale / 255, *forest, work.limits)
-    kernels.join_small(edges[:refused], work.offsets, min_size, *forest)
+    weigh_edges(blurred, work.weights)
+    edges, forest = (work.edges, work.spare), (work.parents, work.sizes)
+    refused = kernels.join_by_weight(
+        work.weights, edges, work.offsets, scale / 255, (*forest, work.limits)
+    )
+    kernels.join_small(work.edges[:refused], work.offsets, min_size, *forest)
     if np.isnan(blurred).any():
         kernels.join_islands(*kernels.gap_edges(blurred, *forest, min_size), min_size, *forest)
     labels = np.empty(image.shape, np.int32)

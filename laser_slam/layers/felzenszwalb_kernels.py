@@ -1,4 +1,4 @@
-"""Compiled parts of the segmentation: sorted edges, union-find, small regions.
+"""Compiled parts of the segmentation: union-find over sorted edges, small regions.
 
 Regions live in a forest over the pixels: ``parents[p]`` leads to the root of p's region, whose
 ``sizes`` counts its pixels. A pixel that is NaN is unknown: it has no edges.
@@ -10,11 +10,8 @@ import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
-NUM_DIRECTIONS = 4  # right, down, down right, down left: each edge once
-PIXEL_BITS, DIRECTION_SHIFT = np.uint64((1 << 30) - 1), np.uint64(30)
-INFINITE_BITS = np.uint32(0x7F800000)  # of a float32; those of NaN are larger
-OCTAVES = np.uint32(32 << 23)  # weights below 2^-32 of the largest are rounding, and count as 0
-LOW_SHIFT, HIGH_SHIFT, DIGITS = np.uint32(6), np.uint32(17), 2048  # 28-bit keys: 11 + 11 + 6
+from laser_slam.layers.edge_kernels import DIRECTION_SHIFT, PIXEL_BITS, part_edges, sort_edges
+
 CHUNK = 256  # edges
 
 
@@ -35,88 +32,16 @@ def read_cells(depth, confidence, step):
     NaN where no pixel of the block has positive, finite depth and confidence above 0.
     """
     height, width = depth.shape
-    cells = np.full(((height + step - 1) // step, (width + step - 1) // step), np.nan)
+    cells = np.empty(((height + step - 1) // step, (width + step - 1) // step))
     for i in range(cells.shape[0]):
         for j in range(cells.shape[1]):
+            cell = np.nan
             for k in range(i * step, min(height, (i + 1) * step)):
                 for m in range(j * step, min(width, (j + 1) * step)):
-                    is_open = np.isnan(cells[i, j]) and confidence[k, m] > 0
-                    if is_open and 0 < depth[k, m] < np.inf:
-                        cells[i, j] = depth[k, m]
+                    if np.isnan(cell) and 0 < depth[k, m] < np.inf and confidence[k, m] > 0:
+                        cell = depth[k, m]
+            cells[i, j] = cell
     return cells
-
-
-@njit(cache=True, nogil=True)
-def weigh_edges(image, weights):
-    """Fill (4, H, W) float32 weights: absolute differences; NaN where there is no edge."""
-    height, width = image.shape
-    weights[0, :, width - 1] = np.nan
-    weights[1, height - 1] = np.nan
-    weights[2, height - 1] = np.nan
-    weights[3, height - 1] = np.nan
-    weights[2, :, width - 1] = np.nan
-    weights[3, :, 0] = np.nan
-    for i in range(height):
-        for j in range(width - 1):
-            weights[0, i, j] = np.float32(abs(image[i, j + 1] - image[i, j]))
-    for i in range(height - 1):
-        for j in range(width):
-            weights[1, i, j] = np.float32(abs(image[i + 1, j] - image[i, j]))
-        for j in range(width - 1):
-            weights[2, i, j] = np.float32(abs(image[i + 1, j + 1] - image[i, j]))
-        for j in range(1, width):
-            weights[3, i, j] = np.float32(abs(image[i + 1, j - 1] - image[i, j]))
-
-
-@njit(cache=True, nogil=True)
-def sort_edges(weights, spare, edges):
-    """Sort the edges by weight, ties by direction and place.
-
-    Args:
-        weights: (4, H, W) float32, NaN: no edge.
-        spare: (4 H W,) uint64, overwritten.
-        edges: (4 H W,) uint64, filled with key, direction (2 bits) and pixel (30 bits).
-
-    Returns:
-        The number of edges, and what to add to a key to get the bits of its weight.
-    """
-    bits = weights.reshape(-1).view(np.uint32)
-    num_pixels = weights.shape[1] * weights.shape[2]
-    top = np.uint32(0)
-    for e in range(bits.size):
-        if bits[e] < INFINITE_BITS:
-            top = max(top, bits[e])
-    base = np.uint32(top - OCTAVES + np.uint32(1)) if top >= OCTAVES else np.uint32(0)
-    low, high = np.zeros(DIGITS + 1, np.uint32), np.zeros(DIGITS + 1, np.uint32)
-    for e in range(bits.size):
-        if bits[e] < INFINITE_BITS:
-            key = np.uint32(bits[e] - base) if bits[e] > base else np.uint32(0)
-            low[((key >> LOW_SHIFT) & np.uint32(DIGITS - 1)) + np.uint32(1)] += np.uint32(1)
-            high[(key >> HIGH_SHIFT) + np.uint32(1)] += np.uint32(1)
-    for d in range(DIGITS):
-        low[d + 1] += low[d]
-        high[d + 1] += high[d]
-    num = np.int64(low[DIGITS])
-    for direction in range(NUM_DIRECTIONS):
-        tag = np.uint64(direction) << DIRECTION_SHIFT
-        for p in range(num_pixels):
-            value = bits[direction * num_pixels + p]
-            if value < INFINITE_BITS:
-                key = np.uint32(value - base) if value > base else np.uint32(0)
-                place = (key >> LOW_SHIFT) & np.uint32(DIGITS - 1)
-                spare[low[place]] = (np.uint64(key) << np.uint64(32)) | tag | np.uint64(p)
-                low[place] += np.uint32(1)
-    for e in range(num):
-        digit = spare[e] >> np.uint64(32 + HIGH_SHIFT)
-        edges[high[digit]] = spare[e]
-        high[digit] += np.uint32(1)
-    for e in range(1, num):  # the last 6 bits: few stand wrong, and none far
-        edge, to = edges[e], e
-        while to > 0 and edges[to - 1] > edge:
-            edges[to] = edges[to - 1]
-            to -= 1
-        edges[to] = edge
-    return num, base
 
 
 @njit(cache=True, nogil=True)
@@ -131,44 +56,71 @@ def find_root(parents, pixel):
 
 
 @njit(cache=True, nogil=True)
-def join_by_weight(edges, base, offsets, scale, parents, sizes, limits):
-    """Join regions along the sorted edges while the weight is below both regions' limits.
+def join_by_weight(weights, work, offsets, scale, forest):
+    """Join regions by rising weight while it is below both regions' limits.
 
-    The limit of a region is its largest inner weight plus ``scale / size``. Edges that are
-    refused are moved to the front of ``edges``.
+    The limit of a region is its largest inner weight plus ``scale / size``. What lies inside a
+    region by the time that its portion's turn comes need not be sorted.
 
-    Returns the number of refused edges.
+    Args:
+        weights: (4, H, W) float32, NaN: no edge.
+        work: two (4 H W,) uint64; the first begins with the refused edges afterwards, sorted.
+        offsets: (4,) uint64 from a pixel to its neighbours.
+        scale: in units of the weights.
+        forest: ``parents``, ``sizes`` and ``limits``.
+
+    Returns:
+        The number of refused edges.
     """
-    num_refused = 0
-    kept = np.empty(CHUNK, np.uint64)
+    edges, spare = work
+    parents, sizes, limits = forest
     for pixel in range(parents.size):
         parents[pixel] = pixel
         sizes[pixel] = 1
         limits[pixel] = scale
+    start, least, num_refused = np.int64(0), np.int64(0), np.int64(0)
+    for end, above in part_edges(weights, edges):
+        num = np.int64(start)
+        for e in range(start, end):
+            pixel = edges[e] & PIXEL_BITS
+            other = pixel + offsets[(edges[e] >> DIRECTION_SHIFT) & np.uint64(3)]
+            edges[num] = edges[e]
+            num += np.int64(parents[parents[pixel]] != parents[parents[other]])
+        sort_edges(edges[start:num], spare, least, above)
+        refused = edges[num_refused:]
+        num_refused += _join_sorted(edges[start:num], offsets, scale, forest, refused)
+        start, least = end, above
+    return num_refused
+
+
+@njit(cache=True, nogil=True)
+def _join_sorted(edges, offsets, scale, forest, refused):
+    """Join along sorted edges; fill the first of ``refused``, and return their number."""
+    parents, sizes, limits = forest
+    num_refused = np.int64(0)
+    kept, ends = np.empty(CHUNK, np.uint64), np.empty((CHUNK, 2), np.uint32)
     for start in range(0, edges.size, CHUNK):
-        num_kept = np.int64(0)  # first, without a branch, drop most edges inside a region
+        num = 0  # first, without a branch, drop most edges inside a region
         for e in range(start, min(start + CHUNK, edges.size)):
-            edge = edges[e]
-            pixel = edge & PIXEL_BITS
-            other = pixel + offsets[(edge >> DIRECTION_SHIFT) & np.uint64(3)]
-            kept[num_kept] = edge
-            num_kept += np.int64(parents[pixel] != parents[other])
-        for e in range(num_kept):
-            edge = kept[e]
-            pixel = edge & PIXEL_BITS
-            other = pixel + offsets[(edge >> DIRECTION_SHIFT) & np.uint64(3)]
-            one, two = find_root(parents, pixel), find_root(parents, other)
+            pixel = edges[e] & PIXEL_BITS
+            other = pixel + offsets[(edges[e] >> DIRECTION_SHIFT) & np.uint64(3)]
+            one, two = parents[parents[pixel]], parents[parents[other]]
+            parents[pixel], parents[other] = one, two
+            kept[num], ends[num, 0], ends[num, 1] = edges[e], one, two
+            num += np.int64(one != two)
+        for e in range(num):
+            one, two = find_root(parents, ends[e, 0]), find_root(parents, ends[e, 1])
             if one == two:
                 continue
-            weight = _as_float32(np.uint32(edge >> np.uint64(32)) + base)
-            if weight < limits[one] and weight < limits[two]:
+            weight = _as_float32(np.uint32(kept[e] >> np.uint64(32)))
+            if weight < min(limits[one], limits[two]):
                 if sizes[one] < sizes[two]:
                     one, two = two, one
                 parents[two] = one
                 sizes[one] += sizes[two]
                 limits[one] = weight + scale / sizes[one]
             else:
-                edges[num_refused] = edge
+                refused[num_refused] = kept[e]
                 num_refused += 1
     return num_refused
 
