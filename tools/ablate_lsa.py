@@ -59,7 +59,7 @@ ROWS = {
     "w/o intra": Row(None, (ON, "layers.intra=false")),
     **{
         f"tau {tau}": Row(None, (ON, f"layers.tau_inter={tau}", f"layers.tau_intra={tau}"))
-        for tau in (0.2, 0.4, 0.5, 0.6)
+        for tau in (0.2, 0.3, 0.4, 0.5, 0.6)
     },
     "w/o IRLS": Row(None, (ON, "registration.scale=closed_form", "layers.scale=closed_form")),
     "w/o Anchor": Row(None, (ON, "registration.rigid=points")),
