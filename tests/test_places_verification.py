@@ -1,5 +1,7 @@
 """Verification of two images: geometry that agrees, or a reason against it."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from rendered import RenderedDrive, seen_from
 from views import street_views
 
 from laser_slam.config import VerificationConfig
-from laser_slam.places import Features, Verification, find_features, verify
+from laser_slam.places import Verification, find_features, verify
 from laser_slam.sim3 import Array
 from laser_slam.types import Image
 
@@ -72,7 +74,7 @@ def test_other_places_fail(
     for other in elsewhere:
         result = check(short_drive.images[FIRST], other, intrinsics)
         assert result.rejected is not None
-        assert result.num_inliers < 0.75 * CONFIG.min_inliers
+        assert result.support < 0.75 * CONFIG.min_support
 
 
 def test_pixels_are_those_of_the_image_as_it_was_given(short_drive: RenderedDrive) -> None:
@@ -100,18 +102,35 @@ def test_blank_images_are_rejected_in_words(short_drive: RenderedDrive, shade: i
     blank = np.full((192, 640, 3), shade, np.uint8)
     for pair in ((blank, blank), (blank, short_drive.images[0]), (short_drive.images[0], blank)):
         result = check(*pair, short_drive.intrinsics)
-        assert result.rejected == f"0 inliers, need {CONFIG.min_inliers}"
-        assert result.inlier_ratio == result.spread == 0
+        assert result.rejected is not None
+        assert result.rejected.startswith("0 inliers count for 0 ")
+        assert result.inlier_ratio == result.support == 0
 
 
-def test_matches_in_one_corner_are_too_few_to_trust(short_drive: RenderedDrive) -> None:
+def test_many_matches_on_one_object_are_no_place(short_drive: RenderedDrive) -> None:
+    """A parked car of the same make: dozens of true matches, all in one part of the image."""
     first, second = (find_features(short_drive.images[i], CONFIG) for i in (FIRST, FIRST + 1))
-    is_left = first.pixels[:, 0] < 100
-    corner = Features(first.pixels[is_left], first.descriptors[is_left], first.size, first.factor)
-    loose = VerificationConfig(min_inliers=8)
-    result = verify(corner, second, short_drive.intrinsics, loose)
+    x, y = first.pixels.T
+    is_on_it = (x < 200) & (y > 48)
+    part = replace(first, pixels=first.pixels[is_on_it], descriptors=first.descriptors[is_on_it])
+    result = verify(part, second, short_drive.intrinsics, CONFIG)
+    assert result.num_inliers > 2 * CONFIG.min_support
     assert result.rejected is not None
-    assert result.rejected.startswith("inliers in 0.")
+    assert result.rejected.endswith("by their spread, need 30")
+    assert verify(first, second, short_drive.intrinsics, CONFIG).rejected is None
+
+
+def test_matches_that_disagree_are_no_place(short_drive: RenderedDrive) -> None:
+    """Most features of a place, moved about in the image: many matches agree, more do not."""
+    first, second = (find_features(short_drive.images[i], CONFIG) for i in (FIRST, FIRST + 1))
+    chance = np.random.default_rng(0)
+    pixels = first.pixels.copy()
+    moved = chance.random(len(pixels)) < 0.8
+    pixels[moved] = chance.permutation(pixels[moved])
+    result = verify(replace(first, pixels=pixels), second, short_drive.intrinsics, CONFIG)
+    assert result.support >= CONFIG.min_support
+    assert result.rejected is not None
+    assert result.rejected.startswith("inlier ratio 0.")
 
 
 def test_the_same_images_always_give_the_same_verdict(short_drive: RenderedDrive) -> None:

@@ -208,7 +208,8 @@ def print_candidates(
         typer.echo(
             f"  {word} {pair[0]}-{pair[1]}: similarity {candidate.similarity:.2f}, "
             f"contrast {candidate.contrast:.1f}, {verdict.num_inliers} inliers of "
-            f"{verdict.num_matches}, spread {verdict.spread:.2f}; {verdict.rejected or 'verified'}"
+            f"{verdict.num_matches}, support {verdict.support}; "
+            f"{'rejected' if verdict.rejected else 'verified'}"
         )
 
 
@@ -270,8 +271,8 @@ def _truth_of_poses(
     distance = np.linalg.norm(centres[:, None] - centres, axis=2)
     cosine = (np.einsum("iab,jab->ij", rotations, rotations) - 1) / 2
     turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-    steps = np.linalg.norm(np.diff(centres, axis=0, prepend=centres[:1]), axis=1)
-    travelled = np.asarray(np.cumsum(steps) / median_depth, np.float64)
+    travelled = np.zeros(len(centres))
+    travelled[1:] = np.cumsum(np.linalg.norm(np.diff(centres, axis=0), axis=1)) / median_depth
     right = (distance < limits[0]) & (turn < limits[1])
     wrong = (distance > WRONG * limits[0]) | (turn > WRONG * limits[1])
     return Truth(right, wrong, travelled)
@@ -284,7 +285,7 @@ def _truth_of_ranges(frames: NDArray[np.int64], same: str, step: float) -> Truth
         first, _, last = part.partition(":")
         is_there |= (frames >= int(first)) & (frames <= int(last))
     right = is_there[:, None] & is_there
-    return Truth(right, ~right, step * np.arange(len(frames)))
+    return Truth(right, ~right, step * np.arange(len(frames), dtype=np.float64))
 
 
 if __name__ == "__main__":

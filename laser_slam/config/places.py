@@ -18,12 +18,11 @@ class VerificationConfig(Section):
     max_error_px: float = Field(
         1.0, gt=0, description="distance from the epipolar line of an inlier, px at this width"
     )
-    min_inliers: int = Field(40, ge=8, description="matches that must agree on one motion")
+    min_support: int = Field(
+        30, ge=8, description="matches that agree on one motion, a few at most of each image part"
+    )
     min_inlier_ratio: float = Field(
         0.5, ge=0, le=1, description="share of the matches that must agree"
-    )
-    min_spread: float = Field(
-        0.25, ge=0, le=1, description="share of the image's cells that inliers must reach"
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ from laser_slam.sim3 import Array
 from laser_slam.types import Image
 
 CELLS = (4, 8)  # rows by columns of the grid that tells how far inliers are spread
+PER_CELL = 4  # inliers that count: a car of the same make, elsewhere, brings dozens, in few cells
 MIN_MATCHES = 8  # of a fundamental matrix; with fewer there is nothing to agree on
 CONTRAST = 0.02  # half of OpenCV's threshold: road and walls keep features
 RANSAC = {"max_iterations": 2000, "min_iterations": 200, "success_prob": 0.9999, "seed": 0}
@@ -44,7 +45,8 @@ class Verification:
         num_matches: features that resemble each other and nothing else.
         first_pixels: (M, 2) x, y of the matches that agree on one motion, in the first image.
         second_pixels: (M, 2) the same points in the second image.
-        spread: share of the image's cells that these reach, in the image where it is less.
+        support: number of these, at most ``PER_CELL`` of each cell of a grid over the image, in
+            the image where it is less.
         second_from_first: (4, 4) the camera's motion, its translation of unit length and of no
             meaning where the camera only turned; None: intrinsics unknown, or no motion found.
         rejected: why these are not taken for one place, in words; None: they are.
@@ -53,7 +55,7 @@ class Verification:
     num_matches: int
     first_pixels: Array
     second_pixels: Array
-    spread: float
+    support: int
     second_from_first: Array | None
     rejected: str | None
 
@@ -85,10 +87,9 @@ def verify(
     max_error = config.max_error_px * max(first.factor, second.factor)
     motion, inliers = _fit_motion(a, b, intrinsics, max_error)
     a, b = a[inliers], b[inliers]
-    spread = min(_spread(a, first.size), _spread(b, second.size))
-    result = Verification(len(i), a, b, spread, motion, None)
-    reason = _reason_against(result, config)
-    return Verification(len(i), a, b, spread, motion, reason)
+    support = min(_support(a, first.size), _support(b, second.size))
+    result = Verification(len(i), a, b, support, motion, None)
+    return replace(result, rejected=_reason_against(result, config))
 
 
 def find_features(image: Image, config: VerificationConfig) -> Features:
@@ -155,19 +156,21 @@ def _fit_motion(
     return motion, np.array(info["inliers"], np.bool_)
 
 
-def _spread(pixels: Array, size: tuple[int, int]) -> float:
-    """Return the share of an image's cells that (N, 2) pixels reach."""
+def _support(pixels: Array, size: tuple[int, int]) -> int:
+    """Count (N, 2) pixels, at most ``PER_CELL`` of each cell."""
     cells = np.floor(pixels[:, ::-1] / size * CELLS).astype(np.int64)
     cells = np.clip(cells, 0, np.array(CELLS) - 1)
-    return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
+    counts = np.bincount(cells[:, 0] * CELLS[1] + cells[:, 1])
+    return int(np.minimum(counts, PER_CELL).sum())
 
 
 def _reason_against(result: Verification, config: VerificationConfig) -> str | None:
     """Say in words which threshold two images fail; None: none."""
-    if result.num_inliers < config.min_inliers:
-        return f"{result.num_inliers} inliers, need {config.min_inliers}"
+    if result.support < config.min_support:
+        return (
+            f"{result.num_inliers} inliers count for {result.support} by their spread, "
+            f"need {config.min_support}"
+        )
     if result.inlier_ratio < config.min_inlier_ratio:
         return f"inlier ratio {result.inlier_ratio:.2f}, need {config.min_inlier_ratio:.2f}"
-    if result.spread < config.min_spread:
-        return f"inliers in {result.spread:.2f} of the image, need {config.min_spread:.2f}"
     return None
