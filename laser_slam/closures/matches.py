@@ -220,7 +220,9 @@ def _covariance(points: Correspondences, a_from_b: Sim3, noise: _Noise, a: End) 
         num = int(np.count_nonzero(np.bincount(cluster[weight > 0])))
         meat += min(num, alike) * (sums.T @ sums)
     inverse = np.linalg.pinv(hessian, rcond=_RANK, hermitian=True)
-    whole = np.repeat([_TURN, _MOVE, _GROWTH], [3, 3, 1])
+    # In one pair of images a single object may have most of the say on the scale.
+    few = np.sqrt(_PAIRS_ALIKE / min(len(np.unique(points.pair)), _PAIRS_ALIKE))
+    whole = np.repeat([_TURN, _MOVE, few * _GROWTH], [3, 3, 1])
     units = np.repeat([1.0, _unit(points), 1.0], [3, 3, 1])
     at_pivot = units[:, None] * (inverse @ meat @ inverse + np.diag(whole**2)) * units
     carry = moved_by(a_from_b.translation, a_from_b.apply(_pivot(points)))
