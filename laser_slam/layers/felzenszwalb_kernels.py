@@ -35,13 +35,20 @@ def read_cells(depth, confidence, step):
     cells = np.empty(((height + step - 1) // step, (width + step - 1) // step))
     for i in range(cells.shape[0]):
         for j in range(cells.shape[1]):
-            cell = np.nan
-            for k in range(i * step, min(height, (i + 1) * step)):
-                for m in range(j * step, min(width, (j + 1) * step)):
-                    if np.isnan(cell) and 0 < depth[k, m] < np.inf and confidence[k, m] > 0:
-                        cell = depth[k, m]
-            cells[i, j] = cell
+            block = slice(i * step, (i + 1) * step), slice(j * step, (j + 1) * step)
+            z = depth[i * step, j * step]
+            is_known = (z > 0) & (z < np.inf) & (confidence[i * step, j * step] > 0)
+            cells[i, j] = z if is_known else _first_known(depth[block], confidence[block])
     return cells
+
+
+@njit(cache=True, nogil=True)
+def _first_known(depth, confidence):
+    for k in range(depth.shape[0]):
+        for m in range(depth.shape[1]):
+            if 0 < depth[k, m] < np.inf and confidence[k, m] > 0:
+                return np.float64(depth[k, m])
+    return np.nan
 
 
 @njit(cache=True, nogil=True)
@@ -100,15 +107,9 @@ def _join_sorted(edges, offsets, scale, forest, refused):
     num_refused = np.int64(0)
     kept, ends = np.empty(CHUNK, np.uint64), np.empty((CHUNK, 2), np.uint32)
     for start in range(0, edges.size, CHUNK):
-        num = 0  # first, without a branch, drop most edges inside a region
-        for e in range(start, min(start + CHUNK, edges.size)):
-            pixel = edges[e] & PIXEL_BITS
-            other = pixel + offsets[(edges[e] >> DIRECTION_SHIFT) & np.uint64(3)]
-            one, two = parents[parents[pixel]], parents[parents[other]]
-            parents[pixel], parents[other] = one, two
-            kept[num], ends[num, 0], ends[num, 1] = edges[e], one, two
-            num += np.int64(one != two)
-        for e in range(num):
+        for e in range(
+            _between_regions(edges[start : start + CHUNK], offsets, parents, kept, ends)
+        ):
             one, two = find_root(parents, ends[e, 0]), find_root(parents, ends[e, 1])
             if one == two:
                 continue
@@ -126,17 +127,44 @@ def _join_sorted(edges, offsets, scale, forest, refused):
 
 
 @njit(cache=True, nogil=True)
+def _between_regions(edges, offsets, parents, kept, ends):
+    """Collect, without a branch, the edges that do not seem to lie inside a region.
+
+    Args:
+        edges: (E,) uint64.
+        offsets: (4,) uint64.
+        parents: (H W,) uint32; paths are shortened.
+        kept: at least (E,) uint64, filled.
+        ends: at least (E, 2) uint32, filled with pixels nearer to the roots.
+
+    Returns:
+        The number of edges that were kept.
+    """
+    num = np.int64(0)
+    for edge in edges:
+        pixel = edge & PIXEL_BITS
+        other = pixel + offsets[(edge >> DIRECTION_SHIFT) & np.uint64(3)]
+        one, two = parents[parents[pixel]], parents[parents[other]]
+        parents[pixel], parents[other] = one, two
+        kept[num], ends[num, 0], ends[num, 1] = edge, one, two
+        num += np.int64(one != two)
+    return num
+
+
+@njit(cache=True, nogil=True)
 def join_small(edges, offsets, min_size, parents, sizes):
     """Join along the sorted edges what is smaller than ``min_size`` pixels on either side."""
-    for e in range(edges.size):
-        pixel = edges[e] & PIXEL_BITS
-        other = pixel + offsets[(edges[e] >> DIRECTION_SHIFT) & np.uint64(3)]
-        one, two = find_root(parents, pixel), find_root(parents, other)
-        if one != two and (sizes[one] < min_size or sizes[two] < min_size):
-            if sizes[one] < sizes[two]:
-                one, two = two, one
-            parents[two] = one
-            sizes[one] += sizes[two]
+    kept, ends = np.empty(CHUNK, np.uint64), np.empty((CHUNK, 2), np.uint32)
+    for start in range(0, edges.size, CHUNK):
+        for e in range(
+            _between_regions(edges[start : start + CHUNK], offsets, parents, kept, ends)
+        ):
+            one, two = find_root(parents, ends[e, 0]), find_root(parents, ends[e, 1])
+            if one != two and min(sizes[one], sizes[two]) < min_size:
+                if sizes[one] < sizes[two]:
+                    one, two = two, one
+                parents[two] = one
+                sizes[one] += sizes[two]
 
 
 @njit(cache=True, nogil=True)
