@@ -23,13 +23,11 @@ from laser_slam.datasets.base import Dataset
 from laser_slam.evaluation.trajectory import evaluate_trajectory
 from laser_slam.export import write_ply
 from laser_slam.fusion import fuse
-from laser_slam.layers import apply_layers
 from laser_slam.rectification import Rectifier, load_calibration, save_calibration
 from laser_slam.report import stages_picture
 from laser_slam.results import (
     Results,
     Scores,
-    StoredWindow,
     describe_layers,
     describe_sequence,
     draw_depth,
@@ -44,7 +42,7 @@ from laser_slam.results import (
     write_trajectories,
 )
 from laser_slam.sim3 import interpolate_poses
-from laser_slam.slam import Slam
+from laser_slam.slam import Slam, StoredWindow, read_window
 from laser_slam.store import WindowFiles, link_latest, new_run_folder, open_run_folder
 from laser_slam.types import (
     NO_DISTORTION,
@@ -279,11 +277,7 @@ class Pipeline:
         }
 
     def _load(self, index: int) -> StoredWindow:
-        raw, colors = self._files.load(index)
-        if not self._config.has_layers:
-            return StoredWindow(raw, raw, colors, None)
-        layers = self._files.load_layers(index)
-        return StoredWindow(raw, apply_layers(raw, layers, self._config.layers), colors, layers)
+        return read_window(self._files, index, self._config)
 
 
 def _resize(images: tuple[Image, ...], size: tuple[int, ...]) -> Image:

@@ -18,7 +18,6 @@ from laser_slam.results.report import (
 from laser_slam.results.scores import (
     KeyframeView,
     Scores,
-    StoredWindow,
     sample_views,
     score_views,
 )
@@ -27,7 +26,6 @@ __all__ = [
     "KeyframeView",
     "Results",
     "Scores",
-    "StoredWindow",
     "describe_layers",
     "describe_sequence",
     "draw_depth",

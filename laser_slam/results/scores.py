@@ -11,27 +11,10 @@ from numpy.typing import NDArray
 
 from laser_slam.evaluation.depth import evaluate_depth
 from laser_slam.evaluation.trajectory import TrajectoryErrors
-from laser_slam.slam import Node
-from laser_slam.types import Image, Layers, Prediction
+from laser_slam.slam import Node, StoredWindow
+from laser_slam.types import Image
 
 Labels = NDArray[np.uint16]
-
-
-@dataclass(frozen=True)
-class StoredWindow:
-    """What a run has on disk of one window.
-
-    Attributes:
-        raw: as the backbone predicted it.
-        corrected: with the scales of its layers applied; ``raw`` where there are none.
-        colors: (N, H, W, 3) RGB.
-        layers: None: they were not looked at.
-    """
-
-    raw: Prediction
-    corrected: Prediction
-    colors: Image
-    layers: Layers | None
 
 
 Load = Callable[[int], StoredWindow]

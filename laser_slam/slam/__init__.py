@@ -2,5 +2,6 @@
 
 from laser_slam.slam.chain import Slam
 from laser_slam.slam.node import Node
+from laser_slam.slam.stored import StoredWindow, read_window
 
-__all__ = ["Node", "Slam"]
+__all__ = ["Node", "Slam", "StoredWindow", "read_window"]
