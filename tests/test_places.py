@@ -178,9 +178,16 @@ def test_of_neighbouring_pairs_the_most_similar_one_is_proposed() -> None:
     assert chosen[0].similarity == max(hit.similarity for hit in hits)
 
 
-def test_a_pair_suppresses_its_neighbours_in_the_windows_that_follow() -> None:
+def test_a_pair_stands_for_less_similar_ones_of_the_windows_that_follow() -> None:
     config = PlacesConfig(suppression=30, max_per_window_pair=50, max_per_window=50)
-    assert len(drive([*range(100), *range(20, 40)], config)) == 1
+    everything = PlacesConfig(suppression=0, max_per_window_pair=50, max_per_window=50)
+    way = [*range(100), *range(20, 60)]
+    hits = drive(way, config)
+    similarities = [hit.similarity for hit in sorted(hits, key=lambda hit: hit.newer.frame)]
+    assert len({hit.newer.window for hit in drive(way, everything)}) == 4
+    assert len(hits) < 4
+    assert similarities == sorted(similarities)
+    assert similarities[-1] == max(hit.similarity for hit in drive(way, everything))
 
 
 def test_two_windows_get_no_more_than_their_few_candidates() -> None:
@@ -233,3 +240,5 @@ def test_a_way_that_falls_is_refused() -> None:
     search.add([Place(0, 0, 5.0)], looks([0]))
     with pytest.raises(ValueError, match="cannot fall"):
         search.add([Place(1, 0, 4.0)], looks([1]))
+    with pytest.raises(ValueError, match="must be finite"):
+        search.add([Place(1, 0, float("nan"))], looks([1]))

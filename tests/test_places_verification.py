@@ -100,8 +100,9 @@ def test_images_may_differ_in_size(short_drive: RenderedDrive) -> None:
 @pytest.mark.parametrize("shade", [0, 255])
 def test_blank_images_are_rejected_in_words(short_drive: RenderedDrive, shade: int) -> None:
     blank = np.full((192, 640, 3), shade, np.uint8)
-    for pair in ((blank, blank), (blank, short_drive.images[0]), (short_drive.images[0], blank)):
-        result = check(*pair, short_drive.intrinsics)
+    image = short_drive.images[0]
+    for first, second in ((blank, blank), (blank, image), (image, blank)):
+        result = check(first, second, short_drive.intrinsics)
         assert result.rejected is not None
         assert result.rejected.startswith("0 inliers count for 0 ")
         assert result.inlier_ratio == result.support == 0

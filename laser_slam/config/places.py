@@ -42,7 +42,7 @@ class PlacesConfig(Section):
         5.0, gt=0, description="way between two visits of a place, in median depths"
     )
     suppression: float = Field(
-        0.5, ge=0, description="way at both ends within which the best pair stands for all, same"
+        0.3, ge=0, description="way at both ends within which the best pair stands for all, same"
     )
     max_per_keyframe: int = Field(3, ge=1, description="places that one keyframe may be")
     max_per_window_pair: int = Field(2, ge=1, description="candidates between two windows")

@@ -90,26 +90,27 @@ class CandidateSearch:
     def add(self, places: Sequence[Place], descriptors: Array32) -> list[Candidate]:
         """Look for earlier visits of the next keyframes, then remember them.
 
-        A pair that was proposed before stands for its neighbours for good: of the same two
-        stretches of road, one window's keyframes bring at most a few.
+        A pair stands for less similar ones near it at both ends, in the windows that follow, too.
 
         Args:
-            places: M keyframes, in order; those of one window, or as many as are at hand.
+            places: M keyframes, in order, not compared with each other: those that one window
+                owns, or fewer.
             descriptors: (M, D) of unit length, or zeros.
 
         Returns:
             Pairs of old and new keyframes, most similar first.
 
         Raises:
-            ValueError: the way travelled falls, or counts disagree.
+            ValueError: the way travelled falls or is not finite, or counts disagree.
         """
         if not len(places):
             return []
         travelled = np.array([place.travelled for place in places])
         if len(descriptors) != len(places):
             raise ValueError(f"{len(places)} places, {len(descriptors)} descriptors")
-        if (np.diff(np.concatenate([self._travelled[-1:], travelled])) < 0).any():
-            raise ValueError("the way travelled cannot fall")
+        steps = np.diff(np.concatenate([self._travelled[-1:], travelled]))
+        if not (np.isfinite(travelled).all() and (steps >= 0).all()):
+            raise ValueError("the way travelled must be finite and cannot fall")
         hits = self._hits(places, descriptors) if len(self._places) else []
         chosen = self._choose(sorted(hits, key=lambda hit: -hit.similarity))
         self._index.insert(descriptors)
@@ -162,17 +163,21 @@ class CandidateSearch:
             windows = (hit.older.window, hit.newer.window)
             is_full = pairs[windows] >= self._config.max_per_window_pair
             is_full |= singles[hit.newer.window] >= self._config.max_per_window
-            if not (is_full or any(self._is_same(hit, other) for other in taken)):
+            if not (is_full or any(self._stands_for(other, hit) for other in taken)):
                 pairs[windows] += 1
                 singles[hit.newer.window] += 1
                 taken.append(hit)
                 chosen.append(hit)
         return chosen
 
-    def _is_same(self, first: Candidate, second: Candidate) -> bool:
-        """Tell whether two pairs are of the same two places: near each other at *both* ends."""
+    def _stands_for(self, taken: Candidate, hit: Candidate) -> bool:
+        """Tell whether a pair is as good as ``hit`` and near it at *both* ends.
+
+        Near at one end only is another loop of a place that was seen more than twice.
+        """
         radius = self._config.suppression
         return (
-            abs(first.older.travelled - second.older.travelled) <= radius
-            and abs(first.newer.travelled - second.newer.travelled) <= radius
+            taken.similarity >= hit.similarity
+            and abs(taken.older.travelled - hit.older.travelled) <= radius
+            and abs(taken.newer.travelled - hit.newer.travelled) <= radius
         )
