@@ -13,6 +13,7 @@ from laser_slam.layers.correction_kernels import add_curve, scale_depth, spread_
 from laser_slam.types import Layers, Prediction
 
 Float = NDArray[np.float32]
+_Curve = tuple[np.float32, np.float32, Float]  # first log depth, knots per unit of it, log factors
 
 MAX_STEP = np.float32(0.03)  # of log depth from cell to cell, beyond which a surface ends
 _KNOTS = 4096  # of the curve, evenly spaced: no search; 1e-3 of log depth apart
@@ -32,10 +33,11 @@ def apply_layers(prediction: Prediction, layers: Layers, config: LayersConfig) -
     if block == 1:
         frames = range(len(prediction.frames))
         return replace(prediction, depth=corrected_cells(prediction, layers, frames, config))
-    out = np.empty_like(prediction.depth, order="C")
+    out, curve = np.empty_like(prediction.depth, order="C"), _even(layers.curve)
     for frame, depth in enumerate(prediction.depth):
         cells = _cells(depth, config)
-        scale_depth(depth, cells, _factors(cells, layers, frame, config), block, out[frame])
+        factors = _factors(cells, layers, frame, curve, config)
+        scale_depth(depth, cells, factors, block, out[frame])
     return replace(prediction, depth=out)
 
 
@@ -46,8 +48,9 @@ def corrected_cells(
     chosen = list(frames)
     out = np.array([_cells(prediction.depth[frame], config) for frame in chosen])
     if not _changes_nothing(layers):
+        curve = _even(layers.curve)
         for k, frame in enumerate(chosen):
-            out[k] *= _factors(out[k], layers, frame, config)
+            out[k] *= _factors(out[k], layers, frame, curve, config)
     return out
 
 
@@ -60,7 +63,20 @@ def _cells(depth: Float, config: LayersConfig) -> Float:
     return np.ascontiguousarray(depth[::block, ::block])
 
 
-def _factors(cells: Float, layers: Layers, frame: int, config: LayersConfig) -> Float:
+def _even(curve: NDArray[np.float64]) -> _Curve | None:
+    """Return a curve at evenly spaced knots; None: no curve."""
+    if not len(curve):
+        return None
+    depths, factors = np.log(curve).T
+    even = np.linspace(depths[0], depths[-1], _KNOTS)
+    per_unit = (_KNOTS - 1) / max(depths[-1] - depths[0], 1e-6)
+    values = np.interp(even, depths, factors).astype(np.float32)
+    return np.float32(depths[0]), np.float32(per_unit), values
+
+
+def _factors(
+    cells: Float, layers: Layers, frame: int, curve: _Curve | None, config: LayersConfig
+) -> Float:
     """Return the (h, w) factor of each cell of a frame; 1 where depth is unknown."""
     with np.errstate(divide="ignore", invalid="ignore"):
         log_depth = np.log(cells)
@@ -69,10 +85,6 @@ def _factors(cells: Float, layers: Layers, frame: int, config: LayersConfig) -> 
     reach = config.feather / config.segmentation.downscale
     fade = np.float32(np.exp(-1 / reach) if reach > 0 else 0.0)
     out: Float = spread_scales(layers.labels[frame], by_label, log_depth, fade, MAX_STEP)
-    if len(layers.curve):
-        depths, factors = np.log(layers.curve).T
-        even = np.linspace(depths[0], depths[-1], _KNOTS)
-        per_unit = np.float32((_KNOTS - 1) / max(depths[-1] - depths[0], 1e-6))
-        curve = np.interp(even, depths, factors).astype(np.float32)
-        add_curve(out, log_depth, np.float32(depths[0]), per_unit, curve)
+    if curve is not None:
+        add_curve(out, log_depth, *curve)
     return np.exp(out, out=out)

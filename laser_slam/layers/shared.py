@@ -16,6 +16,8 @@ Float = NDArray[np.float32]
 Indices = NDArray[np.int64]
 Labels = NDArray[np.uint16]
 
+_SAMPLES = 20_000  # cells that tell how far two windows are apart
+
 
 @dataclass(frozen=True)
 class SharedDepth:
@@ -37,10 +39,12 @@ class SharedDepth:
         Args:
             source: (K, h, w) depth of the current window, perhaps corrected.
         """
-        used = self.weight > 0
-        if not used.any():
+        used = np.flatnonzero(self.weight > 0)
+        if not len(used):
             return None
-        return float(np.median(np.abs(np.log(source[used] / self.target[used]))))
+        used = used[:: len(used) // _SAMPLES + 1]
+        ratios = source.reshape(-1)[used] / self.target.reshape(-1)[used]
+        return float(np.median(np.abs(np.log(ratios))))
 
 
 def shared_depth(

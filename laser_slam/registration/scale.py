@@ -17,10 +17,10 @@ Indices = NDArray[np.int64]
 # Neighbouring frames of a window share the errors of one adjustment: so many count as one. True
 # errors are then about 0.5 sigma where frames err alone and 2 where errors grow along the window.
 FRAMES_ALIKE = 5
-_MAX_PIXELS = 60_000  # of all shared frames; a thinner sample moves the scale by about 1e-4
+_MAX_PIXELS = 40_000  # of all shared frames; a thinner sample moves the scale by about 1e-4
 _TILES = (3, 6)  # rows, columns; what one object distorts, it distorts within a tile or so
 _HUBER = 1.345  # in standard deviations: 95 % efficient on normal noise
-_MAX_MEDIAN = 20_000  # values for the median of a confidence map
+_MAX_MEDIAN = 10_000  # values for the median of a confidence map
 _MAX_ROUNDS = 100
 _TOLERANCE = 1e-9  # relative
 # A frame's scale is off by a few percent in a good window. As a prior worth one frame it keeps
