@@ -224,7 +224,7 @@ def draw(
     mpl.use("Agg")
     figure, axes = plt.subplots(figsize=(9, 8), layout="constrained")
     shown = np.where(is_asked, similarity, np.nan)
-    image = axes.imshow(shown, cmap="magma", vmin=-0.1, vmax=0.6, interpolation="nearest")
+    image = axes.imshow(shown, cmap="magma", vmin=0, vmax=0.3, interpolation="nearest")
     figure.colorbar(image, label="similarity, mean of the run removed")
     for is_kept, color, label in ((True, "lime", "verified"), (False, "cyan", "rejected")):
         pairs = [
