@@ -97,13 +97,20 @@ def _gaussian(image: Array, radius: int, sigma: float) -> Array:
     return np.asarray(cv2.GaussianBlur(image, size, sigma, borderType=cv2.BORDER_REFLECT))
 
 
+def _num_cores() -> int:
+    """Return how many cores this process may use: more threads would share their caches."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 class FelzenszwalbSegmenter:
     """Segment each depth map on its own, frames in parallel."""
 
     def __init__(self, config: SegmentationConfig) -> None:
         self._config = config
         self._local = threading.local()
-        self._pool = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="segmentation")
+        self._pool = ThreadPoolExecutor(_num_cores(), thread_name_prefix="segmentation")
 
     def segment(self, window: Prediction, colors: Image) -> NDArray[np.uint16]:
         """Label the frames by depth alone; see ``Segmenter``."""
