@@ -118,6 +118,7 @@ class TrueBackbone:
     interrupt_at: int | None = None
     calls: int = 0
     remembers: bool = False
+    sees_far_frames: bool = True
 
     def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
         return size

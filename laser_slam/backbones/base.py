@@ -22,6 +22,14 @@ class Backbone(Protocol):
         """
         ...
 
+    @property
+    def sees_far_frames(self) -> bool:
+        """Tell whether ``predict`` takes frames that do not follow one another.
+
+        A window of two visits of a place then measures how they lie to one another.
+        """
+        ...
+
     def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return the (height, width) at which it wants images of (height, width) ``size``."""
         ...

@@ -63,10 +63,11 @@ def _icp(source: Array, target: Array, normals: Array, config: ClosuresConfig) -
     tools = o3d.pipelines.registration
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (source, target)]
     clouds[1].normals = o3d.utility.Vector3dVector(normals)
-    kernel = tools.TukeyLoss(config.max_distance)
+    reach = 2 * config.max_distance
+    kernel = tools.TukeyLoss(reach)
     result = tools.registration_icp(
         *clouds,
-        config.max_distance,
+        reach,
         np.eye(4),
         tools.TransformationEstimationPointToPlane(kernel),
         tools.ICPConvergenceCriteria(max_iteration=_ITERATIONS),

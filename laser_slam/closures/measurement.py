@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from laser_slam.sim3 import Array, Sim3, rotation_log
+from laser_slam.sim3 import Array, Sim3, rotation_exp, rotation_log
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,33 @@ def disagreement(first: Measurement, second: Measurement) -> float:
     """Return how far two measurements of one closure are apart, in sigmas: 2 to 4 is usual."""
     error = error_between(first.a_from_b, second.a_from_b)
     return float(np.sqrt(error @ np.linalg.solve(first.covariance + second.covariance, error)))
+
+
+def fuse(first: Measurement, second: Measurement) -> Measurement:
+    """Return the mean of two measurements of one closure, each weighing what it is sure of.
+
+    Both rest on the same depths, so that two do not make it surer than the surer one: half of the
+    information of each (covariance intersection).
+
+    Returns:
+        The mean, with the residual of the worse and the counts of the first.
+    """
+    gain = first.covariance @ np.linalg.inv(first.covariance + second.covariance)
+    step = gain @ error_between(second.a_from_b, first.a_from_b)
+    start = first.a_from_b
+    mean = Sim3(
+        start.scale * float(np.exp(step[6])),
+        rotation_exp(step[:3]) @ start.rotation,
+        start.translation + step[3:6],
+    )
+    covariance = 2 * (first.covariance - gain @ first.covariance)
+    return replace(
+        first,
+        a_from_b=mean,
+        covariance=(covariance + covariance.T) / 2,
+        residual=max(first.residual, second.residual),
+        source=f"{first.source}, {second.source}",
+    )
 
 
 def moved_by(point: Array, pivot: Array) -> Array:

@@ -48,13 +48,13 @@ class ClosuresConfig(Section):
     voxel: float = Field(0.02, gt=0, description="edge of the clouds' voxels, in median depths")
     max_range: float = Field(3.0, gt=0, description="farther points stay out, in median depths")
     max_distance: float = Field(
-        0.1, gt=0, description="between surfaces that are one, in median depths, or in their depth"
+        0.05, gt=0, description="between surfaces that are one, in median depths, or in their depth"
     )
     min_covisible: float = Field(
-        0.2, ge=0, le=1, description="share of the points that both ends could see"
+        0.1, ge=0, le=1, description="share of the points that both ends could see"
     )
     min_overlap: float = Field(
-        0.6, ge=0, le=1, description="of these, the share that the other end has a surface at"
+        0.7, ge=0, le=1, description="of these, the share that the other end has a surface at"
     )
     max_move: float = Field(
         0.1, gt=0, description="of the cloud by its registration, rms, in median depths"

@@ -35,9 +35,11 @@ class ClassicalBackbone:
 
     Attributes:
         remembers: True, see `laser_slam.backbones.base.Backbone`.
+        sees_far_frames: False, for it follows corners from frame to frame.
     """
 
     remembers = True
+    sees_far_frames = False
 
     def __init__(self, config: BackboneConfig) -> None:
         self._config = config.classical

@@ -51,12 +51,14 @@ class SimulatedBackbone:
 
     Attributes:
         remembers: False, see `laser_slam.backbones.base.Backbone`.
+        sees_far_frames: True, same.
 
     Raises:
         ConfigError: the data set lacks true poses or depth, or the intrinsics.
     """
 
     remembers = False
+    sees_far_frames = True
 
     def __init__(
         self,
