@@ -85,14 +85,11 @@ def join_by_weight(weights, work, offsets, scale, forest):
         parents[pixel] = pixel
         sizes[pixel] = 1
         limits[pixel] = scale
+    ends = spare.view(np.uint32).reshape(-1, 2)
     start, least, num_refused = np.int64(0), np.int64(0), np.int64(0)
     for end, above in part_edges(weights, edges):
-        num = np.int64(start)
-        for e in range(start, end):
-            pixel = edges[e] & PIXEL_BITS
-            other = pixel + offsets[(edges[e] >> DIRECTION_SHIFT) & np.uint64(3)]
-            edges[num] = edges[e]
-            num += np.int64(parents[parents[pixel]] != parents[parents[other]])
+        some = edges[start:end]
+        num = start + _between_regions(some, offsets, parents, some, ends)
         sort_edges(edges[start:num], spare, least, above)
         refused = edges[num_refused:]
         num_refused += _join_sorted(edges[start:num], offsets, scale, forest, refused)
@@ -134,7 +131,7 @@ def _between_regions(edges, offsets, parents, kept, ends):
         edges: (E,) uint64.
         offsets: (4,) uint64.
         parents: (H W,) uint32; paths are shortened.
-        kept: at least (E,) uint64, filled.
+        kept: at least (E,) uint64, filled; may be ``edges``.
         ends: at least (E, 2) uint32, filled with pixels nearer to the roots.
 
     Returns:
