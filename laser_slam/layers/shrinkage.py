@@ -9,10 +9,12 @@ also says what to do with layers that no earlier window has seen.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from threadpoolctl import ThreadpoolController
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -79,10 +81,24 @@ def explain(observed: Observations, num_tracks: int, *, with_curve: bool) -> Dis
     nothing = Distortion(np.empty(0), np.empty(0), np.zeros(num_tracks), (0.0, 0.0))
     if len(observed.log_ratio) < 2:
         return nothing
+    # Matrices this small are solved before a second thread has woken up to wait for its part.
+    with _thread_pools().limit(limits=1, user_api="blas"):
+        distortion = _explain(observed, num_tracks, _STRENGTHS if with_curve else (0.0,))
+    return distortion or nothing
+
+
+@cache
+def _thread_pools() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def _explain(
+    observed: Observations, num_tracks: int, curves: tuple[float, ...]
+) -> Distortion | None:
     near, same = _alike(observed)
-    chosen = _likeliest(near, same, observed, _STRENGTHS if with_curve else (0.0,))
+    chosen = _likeliest(near, same, observed, curves)
     if max(chosen) < _MIN_SIGMA:
-        return nothing
+        return None
     covariance = chosen[0] ** 2 * near + chosen[1] ** 2 * same + np.diag(observed.variance)
     pull = cho_solve(cho_factor(covariance), observed.log_ratio)
     own = chosen[1] ** 2 * same @ pull
