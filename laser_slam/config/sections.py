@@ -184,6 +184,9 @@ class LayersConfig(_Section):
 class PoseGraphConfig(_Section):
     """The places of all windows, from registrations and closures."""
 
+    robust: bool = Field(
+        True, description="closures may be left out; false: all are right, plain least squares"
+    )
     inlier_probability: float = Field(
         0.9999, gt=0.5, lt=1, description="share of right closures that pass the chi-square test"
     )

@@ -114,7 +114,7 @@ def solve(problem: Problem, start: Any, left_out: Flags) -> Fit:
         DegenerateGeometryError: the solver fails.
     """
     plain = fit(problem, start, ~left_out)
-    if _agrees(problem, plain):
+    if not problem.config.robust or _agrees(problem, plain):
         return plain
     chosen = _decide(problem, start)
     if not (~chosen.is_trusted & ~left_out).any():
