@@ -10,7 +10,6 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,12 +17,18 @@ from laser_slam.backbones import make_backbone
 from laser_slam.backbones.base import Backbone
 from laser_slam.bookkeeping import FrameLog, StageClock, identify, run_log
 from laser_slam.camera import resize_intrinsics
+from laser_slam.closures import Tools, make_matcher
 from laser_slam.config import Config
 from laser_slam.datasets.base import Dataset
 from laser_slam.evaluation.trajectory import evaluate_trajectory
 from laser_slam.export import write_ply
 from laser_slam.fusion import fuse
-from laser_slam.rectification import Rectifier, load_calibration, save_calibration
+from laser_slam.rectification import (
+    Rectifier,
+    load_calibration,
+    reduce_images,
+    save_calibration,
+)
 from laser_slam.report import stages_picture
 from laser_slam.results import (
     Results,
@@ -42,7 +47,7 @@ from laser_slam.results import (
     write_trajectories,
 )
 from laser_slam.sim3 import interpolate_poses
-from laser_slam.slam import Slam, StoredWindow, read_window
+from laser_slam.slam import LoopCloser, Slam, StoredWindow, read_window
 from laser_slam.store import WindowFiles, link_latest, new_run_folder, open_run_folder
 from laser_slam.types import (
     NO_DISTORTION,
@@ -112,6 +117,7 @@ class Pipeline:
         self._is_complete = False
         self.folder = Path(os.path.normpath(out)) if out else new_run_folder(self._info.name)
         self._files = WindowFiles(self.folder)
+        self._closer: LoopCloser | None = None
 
     def run(self) -> Results:
         """Map the sequence.
@@ -123,10 +129,14 @@ class Pipeline:
         with run_log(self.folder / "run.log") as warnings:
             with self._clock.stage("calibrate"):
                 self._calibrate()
+            self._closer = self._make_closer()
             for window in self._windows():
                 prediction, colors = self._predict(window)
                 self._place(prediction, colors)
             (self.folder / COMPLETE).touch()
+            if self._closer is not None:
+                with self._clock.stage("places"):
+                    self._closer.finish()
             with self._clock.stage("layers"):
                 self._slam.smooth_layers(self._files)
             trajectory = self._trajectory()
@@ -159,6 +169,12 @@ class Pipeline:
         logger.info("calibration: %s", self._calibration.source)
         if self._calibration.warning:
             logger.warning("calibration: %s", self._calibration.warning)
+
+    def _make_closer(self) -> LoopCloser | None:
+        if not self._config.closures.enabled:
+            return None
+        tools = Tools(make_matcher(self._config.places.verification), self.backbone)
+        return LoopCloser(self._config, self._slam, self._files, tools)
 
     def _first_windows(self) -> Iterator[Window]:
         """Cut windows from the first keyframes, as the camera sees them."""
@@ -197,17 +213,20 @@ class Pipeline:
                     window.images, window.frames, self._rectifier.intrinsics
                 )
             with self._clock.stage("store"):
-                colors = _resize(window.images, prediction.depth.shape[1:])
+                colors = reduce_images(window.images, prediction.depth.shape[1:])
                 prediction = self._files.save(window.index, prediction, colors)
         for warning in prediction.warnings:
             logger.warning("window %d: %s", window.index, warning)
         return prediction, colors
 
     def _place(self, prediction: Prediction, colors: Image) -> None:
-        self._slam.add(prediction, colors)
+        submap = self._slam.add(prediction, colors)
         if self._slam.layers is not None:
             with self._clock.stage("store"):
-                self._files.save_layers(self._slam.nodes[-1].index, self._slam.layers)
+                self._files.save_layers(submap.index, self._slam.layers)
+        if self._closer is not None:
+            with self._clock.stage("places"):
+                self._closer.add(submap.prediction, colors)
         size = (prediction.depth.shape[1], prediction.depth.shape[2])
         self._intrinsics.append(resize_intrinsics(prediction.intrinsics[0], size, self._info.size))
         self._on_progress("mapping", len(self._input.times_s), self._info.num_frames)
@@ -278,11 +297,3 @@ class Pipeline:
 
     def _load(self, index: int) -> StoredWindow:
         return read_window(self._files, index, self._config)
-
-
-def _resize(images: tuple[Image, ...], size: tuple[int, ...]) -> Image:
-    """Reduce the images to (height, width) ``size`` of the depth maps."""
-    height, width = size
-    return np.stack(
-        [cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in images]
-    )

@@ -166,3 +166,11 @@ def _zoom(lens: Array, distortion: Array, size: tuple[int, int]) -> float:
         middle = 0.5 * (low + high)
         low, high = (low, middle) if fits(middle) else (middle, high)
     return high
+
+
+def reduce_images(images: tuple[Image, ...], size: tuple[int, ...]) -> Image:
+    """Reduce images to (height, width) ``size``, such as that of depth maps; (N, h, w, 3) RGB."""
+    height, width = size
+    return np.stack(
+        [cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in images]
+    )

@@ -10,6 +10,7 @@ from laser_slam.config.section import Section
 class ClosuresConfig(Section):
     """Candidates measured and judged."""
 
+    enabled: bool = Field(True, description="look for places seen before and close the loops")
     neighbours: int = Field(
         2, ge=0, description="frames on each side of the matched one that are matched as well"
     )

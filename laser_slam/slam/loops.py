@@ -1,0 +1,132 @@
+"""Loops: places that are seen again, and what the pose graph makes of them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.closures import CandidateEnds, ClosureRecord, End, Tools, judge
+from laser_slam.config import Config
+from laser_slam.errors import DegenerateGeometryError
+from laser_slam.places import Candidate, CandidateSearch, Place, make_descriptor
+from laser_slam.slam.chain import Slam
+from laser_slam.slam.node import Node
+from laser_slam.slam.stored import read_window
+from laser_slam.store import WindowFiles
+from laser_slam.types import Image, Prediction, WindowStatus
+
+Array = NDArray[np.float64]
+
+logger = logging.getLogger(__name__)
+
+
+class LoopCloser:
+    """Look for places seen before as windows come, and close the loops that hold.
+
+    A window is looked at when the next one is there, for only then it is known which frames it
+    owns. Kept in memory are descriptors, records and that one window; older ones are read back.
+    """
+
+    def __init__(self, config: Config, slam: Slam, files: WindowFiles, tools: Tools) -> None:
+        """Start with no place.
+
+        Args:
+            config: all settings.
+            slam: whose windows are looked at, and moved.
+            files: where the run's windows are.
+            tools: what candidates are measured with.
+        """
+        self._config = config
+        self._slam = slam
+        self._files = files
+        self._tools = tools
+        self._descriptor = make_descriptor(config.places)
+        self._search = CandidateSearch(config.places, self._descriptor.size)
+        self._waiting: tuple[Prediction, Image] | None = None
+        self._travelled = 0.0
+        self._records: list[ClosureRecord] = []
+        self._closed: list[int] = []  # which of the records are in the graph, in its order
+
+    @property
+    def records(self) -> list[ClosureRecord]:
+        """Return what became of each candidate; the pose graph has the last word."""
+        records = list(self._records)
+        optimised = self._slam.optimised
+        if optimised is None:
+            return records
+        for row, trusted, misfit in zip(
+            self._closed, optimised.is_trusted, optimised.misfits, strict=True
+        ):
+            if not trusted:
+                verdict = f"the pose graph distrusts it, {misfit:.1f} sigmas off"
+                records[row] = replace(records[row], verdict=verdict)
+        return records
+
+    def add(self, prediction: Prediction, colors: Image) -> None:
+        """Look at the window before the one that was added last.
+
+        Args:
+            prediction: of the window added last, its layers' scales applied.
+            colors: (N, H, W, 3) RGB uint8, at the size of the depth maps.
+        """
+        if self._waiting is not None:
+            self._look(self._slam.nodes[-2], *self._waiting)
+        self._waiting = prediction, colors
+
+    def finish(self) -> None:
+        """Look at the last window."""
+        if self._waiting is not None:
+            self._look(self._slam.nodes[-1], *self._waiting)
+        self._waiting = None
+
+    def _look(self, node: Node, prediction: Prediction, colors: Image) -> None:
+        places = list(self._places(node, prediction))
+        if prediction.status is not WindowStatus.OK or not places:
+            return
+        rows = np.searchsorted(node.frames, [place.frame for place in places])
+        descriptors = np.stack([self._descriptor.describe(colors[row]) for row in rows])
+        for candidate in self._search.add(places, descriptors):
+            self._examine(candidate, prediction, colors)
+
+    def _places(self, node: Node, prediction: Prediction) -> Iterator[Place]:
+        """Give the frames that a window owns, with the way to them in median depths."""
+        known = prediction.depth[:, ::4, ::4]
+        known = known[known > 0]
+        unit = float(np.median(known)) if known.size else 1.0
+        centers = node.window_from_cam[:, :3, 3]
+        steps = np.linalg.norm(np.diff(centers, axis=0, prepend=centers[:1]), axis=1) / unit
+        for row in np.flatnonzero(node.is_owned):
+            self._travelled += float(steps[row])
+            yield Place(int(node.frames[row]), node.index, self._travelled)
+
+    def _examine(self, candidate: Candidate, prediction: Prediction, colors: Image) -> None:
+        older, newer = candidate.older, candidate.newer
+        stored = read_window(self._files, older.window, self._config)
+        a = _end(older, stored.corrected, stored.colors)
+        b = _end(newer, prediction, colors)
+        nodes = self._slam.nodes
+        chain_scale = (
+            nodes[newer.window].world_from_window.scale
+            / nodes[older.window].world_from_window.scale
+        )
+        ends = CandidateEnds(a, b, candidate.similarity, chain_scale)
+        judged = judge(ends, self._tools, self._config)
+        record, found = judged.record, judged.measurement
+        if found is not None:
+            try:
+                self._slam.close(a.window, b.window, found.a_from_b, found.sigmas)
+                self._closed.append(len(self._records))
+            except DegenerateGeometryError as error:
+                record = replace(record, verdict=str(error))
+        self._records.append(record)
+        logger.info("frames %d and %d: %s", a.frame, b.frame, record.verdict)
+
+
+def _end(place: Place, prediction: Prediction, colors: Image) -> End:
+    return End(
+        place.window, prediction, colors, int(np.searchsorted(prediction.frames, place.frame))
+    )
