@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.config import ClosuresConfig, VerificationConfig
-from laser_slam.places import find_features, verify
+from laser_slam.places import Verification, find_features, verify
 from laser_slam.sim3 import Array
 from laser_slam.types import Image, Prediction
 
-# (H, W, 3) RGB of one end and the other, (3, 3) intrinsics of the first -> (M, 2) and (M, 2) pixels
-# of the same points; none where the images do not show one place.
-Matcher = Callable[[Image, Image, Array], tuple[Array, Array]]
+# (H, W, 3) RGB of one end and the other, (3, 3) intrinsics of the first -> what their geometry says
+Matcher = Callable[[Image, Image, Array], Verification]
 
 
 @dataclass(frozen=True)
@@ -68,35 +67,41 @@ class PairMatches:
 def make_matcher(config: VerificationConfig) -> Matcher:
     """Match features and keep those that agree on one motion of the camera."""
 
-    def match(first: Image, second: Image, intrinsics: Array) -> tuple[Array, Array]:
-        found = verify(
-            find_features(first, config), find_features(second, config), intrinsics, config
-        )
-        if found.rejected:
-            return np.zeros((0, 2)), np.zeros((0, 2))
-        return found.first_pixels, found.second_pixels
+    def match(first: Image, second: Image, intrinsics: Array) -> Verification:
+        features = find_features(first, config), find_features(second, config)
+        return verify(*features, intrinsics, config)
 
     return match
 
 
-def match_ends(a: End, b: End, matcher: Matcher, config: ClosuresConfig) -> list[PairMatches]:
+def match_ends(
+    a: End, b: End, matcher: Matcher, config: ClosuresConfig
+) -> tuple[Verification, list[PairMatches]]:
     """Match the frames that were taken for one place, and their neighbours where these match too.
 
     Returns:
-        The matched pair first; empty if it does not match.
+        What the images of the two frames say, and the pairs that match, theirs first; none where
+        theirs do not.
     """
+    first = _verify(a, b, 0, matcher)
+    if first.rejected:
+        return first, []
     reach = np.arange(1, config.neighbours + 1) * config.neighbour_step
-    pairs = []
-    for step in (0, *reach, *-reach):
-        i, j = a.matched + int(step), b.matched + int(step)
-        if not (0 <= i < len(a.colors) and 0 <= j < len(b.colors)):
-            continue
-        pixels_a, pixels_b = matcher(a.colors[i], b.colors[j], a.prediction.intrinsics[i])
-        if len(pixels_a):
-            pairs.append(PairMatches(i, j, pixels_a, pixels_b))
-        elif step == 0:
-            break
-    return pairs
+    pairs = [_pair(a, b, 0, first)]
+    for step in (int(step) for step in (*reach, *-reach)):
+        if 0 <= a.matched + step < len(a.colors) and 0 <= b.matched + step < len(b.colors):
+            found = _verify(a, b, step, matcher)
+            pairs += [] if found.rejected else [_pair(a, b, step, found)]
+    return first, pairs
+
+
+def _verify(a: End, b: End, step: int, matcher: Matcher) -> Verification:
+    i, j = a.matched + step, b.matched + step
+    return matcher(a.colors[i], b.colors[j], a.prediction.intrinsics[i])
+
+
+def _pair(a: End, b: End, step: int, found: Verification) -> PairMatches:
+    return PairMatches(a.matched + step, b.matched + step, found.first_pixels, found.second_pixels)
 
 
 def frames_around(end: End, num: int) -> NDArray[np.int64]:

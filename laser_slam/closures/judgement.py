@@ -98,10 +98,10 @@ def _measure(
     for end in (a, b):
         if end.prediction.status is not WindowStatus.OK or not np.isfinite(end.median_depth):
             raise DegenerateGeometryError(f"window {end.window} has no depth")
-    pairs = match_ends(a, b, tools.matcher, config.closures)
-    numbers.update(image_inliers=len(pairs[0].pixels_a) if pairs else 0, image_pairs=len(pairs))
-    if not pairs:
-        raise DegenerateGeometryError("the images do not match")
+    images, pairs = match_ends(a, b, tools.matcher, config.closures)
+    numbers.update(image_inliers=images.num_inliers, image_pairs=len(pairs))
+    if images.rejected:
+        raise DegenerateGeometryError(f"the images do not match: {images.rejected}")
     found = measure_by_matches(a, b, pairs, config.closures)
     _note(found, numbers)
     if tools.backbone is None or not tools.backbone.sees_far_frames:
