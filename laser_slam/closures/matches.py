@@ -20,6 +20,7 @@ _ROUNDS = 15
 _RANK = 1e-12  # of the largest eigenvalue; what is less sure than that is left as guessed
 _CONVERGED = 1e-6  # radians, median depths, log
 _PIXEL_NOISE = 0.5  # of a match, per axis and image, px at 640 wide; at least
+_COMMON_WIDTH = 640
 _DEPTH_NOISE = 0.005  # of a depth, log; at least
 _DEPTH_GROUPS = 4  # by depth: far ones err more
 _REDESCEND = 25.0  # squared misfit, of 3 numbers in sigmas, from which a match has no say
@@ -175,18 +176,17 @@ def _seen_slopes(points: Correspondences) -> Array:
 def _estimate_noise(points: Correspondences, a_from_b: Sim3, config: ClosuresConfig) -> _Noise:
     """Read the noise off the inliers: pixels across the way that depth errors move them."""
     misfit = points.a.misfit(a_from_b.apply(points.b.points))
-    near = agreement(points, a_from_b, config) > 0
-    near = near if near.sum() >= _DEPTH_GROUPS else np.isfinite(misfit[:, 2])
-    pixel = _spread(misfit[near, :2].ravel()) / np.sqrt(2)
-    pixel = min(pixel, _spread(_across(points, a_from_b, misfit)[near]) / np.sqrt(2))
+    near = np.flatnonzero(agreement(points, a_from_b, config) > 0)
+    least = _PIXEL_NOISE * points.width / _COMMON_WIDTH, _DEPTH_NOISE * np.sqrt(2)
+    if len(near) < _DEPTH_GROUPS:
+        return _Noise(least[0], np.full(len(points), least[1]))
+    pixel = min(_spread(misfit[near, :2].ravel()), _spread(_across(points, a_from_b, misfit)[near]))
     depth = np.log(points.b.depth)
-    groups = np.array_split(np.flatnonzero(near)[np.argsort(depth[near])], _DEPTH_GROUPS)
+    groups = np.array_split(near[np.argsort(depth[near])], _DEPTH_GROUPS)
     spreads = [_spread(misfit[group, 2]) for group in groups]
     middles = [float(np.median(depth[group])) for group in groups]
     ratio = np.interp(depth, middles, np.maximum.accumulate(spreads))
-    return _Noise(
-        max(pixel, _PIXEL_NOISE * points.width / 640), np.maximum(ratio, _DEPTH_NOISE * np.sqrt(2))
-    )
+    return _Noise(max(pixel / np.sqrt(2), least[0]), np.maximum(ratio, least[1]))
 
 
 def _across(points: Correspondences, a_from_b: Sim3, misfit: Array) -> Array:
@@ -202,7 +202,7 @@ def _across(points: Correspondences, a_from_b: Sim3, misfit: Array) -> Array:
 
 
 def _spread(errors: Array) -> float:
-    return 1.4826 * float(np.median(np.abs(errors))) if len(errors) else 0.0
+    return 1.4826 * float(np.median(np.abs(errors)))
 
 
 def _covariance(points: Correspondences, a_from_b: Sim3, noise: _Noise, a: End) -> Array:
