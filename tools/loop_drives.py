@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from revisits import LoopClosure, RevisitRule, find_revisits
@@ -110,21 +109,16 @@ class Outcome:
 
 
 def chain_drive(
-    poses: Path, config: Config, clock: Stopwatch, advance: Callable[[int], None]
+    drive: SyntheticDrive, config: Config, clock: Stopwatch, advance: Callable[[int], None]
 ) -> ChainedDrive:
-    """Build a city along a trajectory file and chain the windows of its drive.
+    """Chain the windows of a drive.
 
     Args:
-        poses: in KITTI's format.
+        drive: through a city.
         config: all settings.
-        clock: is charged for ``city``, ``predict``, ``register``.
+        clock: is charged for ``predict`` and ``register``.
         advance: is told how many frames were done.
-
-    Raises:
-        DatasetError: the file is missing or no path for a car.
     """
-    with clock("city"):
-        drive = SyntheticDrive.from_poses_file(poses, config.synthetic)
     info = drive.info
     if info.truth is None or info.intrinsics is None:
         raise ValueError("a generated drive knows its truth")

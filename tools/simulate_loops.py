@@ -21,20 +21,34 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from loop_drives import Outcome, Stopwatch, chain_drive, close_loops, measure_revisits
-from revisits import RevisitRule, invent_closures
+from loop_drives import (
+    ChainedDrive,
+    Outcome,
+    Stopwatch,
+    chain_drive,
+    close_loops,
+    measure_revisits,
+)
+from revisits import LoopClosure, RevisitRule, invent_closures
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
 from laser_slam.config import Config, load_config
-from laser_slam.datasets.synthetic.paths import read_kitti_poses
+from laser_slam.datasets.synthetic.drive import SyntheticDrive
 from laser_slam.errors import LaserSlamError
 from laser_slam.sim3 import Array
 
-# Errors of the backbone, the same for all sequences, so that chaining without closures drifts as
-# ORB-SLAM2 without loop closure does in the paper's table (mean without 01: 26.5 m).
+# Errors of the backbone, the same for all sequences, such that chaining without closures drifts as
+# ORB-SLAM2 without loop closure, in the LASER paper's KITTI table (mean without 01: 26.5 m).
 SETTINGS = (
+    "backbone.simulated.scale_sigma=0.2",
+    "backbone.simulated.smooth_sigma=0.03",
+    "backbone.simulated.layer_sigma=0.08",
+    "backbone.simulated.pose_rotation_deg=0.1",
+    "backbone.simulated.pose_translation=0.003",
+    "backbone.simulated.drift_rotation_deg=0.05",
+    "backbone.simulated.drift_translation=0.02",
     "backbone.name=simulated",
     "layers.enabled=never",
     "synthetic.width=126",
@@ -55,12 +69,19 @@ PUBLISHED = {
     "LASER pi3": (6.14, 121.61, 59.87, 2.64, 1.36, 2.73, 2.92, 2.28, 33.14, 17.95, 15.20),
 }
 # fmt: on
+# Columns of CPU seconds, and what they were charged to.
+TIMED = {
+    "city s": "city",
+    "windows s": "predict",
+    "chain s": "register",
+    "loop windows s": "measure",
+}
 Case = tuple[float, bool]  # share of wrong closures, robust decision
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a sequence gave.
+    """What one simulation of a sequence gave.
 
     Attributes:
         name: of the sequence.
@@ -91,38 +112,54 @@ class Plan:
         shares: of wrong closures among all, each a case of its own.
         group: wrong closures in a row that agree.
         rule: which pairs are revisits.
+        seeds: simulations with errors of their own.
     """
 
     shares: tuple[float, ...]
     group: int
     rule: RevisitRule
+    seeds: int
 
 
-def simulate(poses: Path, config: Config, plan: Plan, progress: Progress) -> Result:
-    """Chain a drive and close its loops in every way of the plan."""
-    task = progress.add_task(poses.stem, total=len(read_kitti_poses(poses)) - 1)
+def simulate(poses: Path, config: Config, plan: Plan, progress: Progress) -> list[Result]:
+    """Drive along a trajectory file with the errors of each seed, and close the loops."""
+    task = progress.add_task(f"{poses.stem}: city", total=None)
     clock = Stopwatch()
-    drive = chain_drive(poses, config, clock, lambda frames: progress.advance(task, frames))
-    progress.update(task, description=f"{poses.stem}: loops", completed=0, total=None)
-    right, off = measure_revisits(drive, plan.rule, clock)
-    outcomes = {}
-    for share in plan.shares:
-        num = int(np.ceil(share / (1 - share) * max(len(right), MIN_WRONG_OF)))
-        nodes, truth = drive.slam.nodes, drive.truth
-        closures = [*right, *invent_closures(num, nodes, truth, right, plan.group)]
-        for robust in (True, False):
-            outcomes[share, robust] = close_loops(drive, closures, with_decision(config, robust))
+    with clock("city"):
+        drive = SyntheticDrive.from_poses_file(poses, config.synthetic)
+    first = config.backbone.simulated.seed
+    results = []
+    for seed in range(first, first + plan.seeds):
+        progress.reset(task, total=drive.info.num_frames, description=f"{poses.stem}: windows")
+        seeded, seconds = with_seed(config, seed), Stopwatch()
+        chained = chain_drive(drive, seeded, seconds, lambda num: progress.advance(task, num))
+        progress.reset(task, total=2 * len(plan.shares), description=f"{poses.stem}: loops")
+        right, off = measure_revisits(chained, plan.rule, seconds)
+        outcomes = {}
+        for share, robust in _cases(plan.shares):
+            closures = [*right, *_wrong(chained, right, share, plan.group)]
+            outcomes[share, robust] = close_loops(chained, closures, with_decision(seeded, robust))
+            progress.advance(task)
+        times = {**clock.seconds, **seconds.seconds}
+        counts = len(chained.truth.frames), len(chained.slam.nodes)
+        errors = chained.path_m, chained.ate_m(chained.slam)
+        results.append(Result(poses.stem, *counts, *errors, off, outcomes, times))
     progress.remove_task(task)
-    return Result(
-        poses.stem,
-        len(drive.truth.frames),
-        len(drive.slam.nodes),
-        drive.path_m,
-        drive.ate_m(drive.slam),
-        off,
-        outcomes,
-        clock.seconds,
-    )
+    return results
+
+
+def _wrong(
+    chained: ChainedDrive, right: Sequence[LoopClosure], share: float, group: int
+) -> list[LoopClosure]:
+    num = int(np.ceil(share / (1 - share) * max(len(right), MIN_WRONG_OF)))
+    return invent_closures(num, chained.slam.nodes, chained.truth, right, group)
+
+
+def with_seed(config: Config, seed: int) -> Config:
+    """Change the seed of the backbone's errors."""
+    simulated = config.backbone.simulated.model_copy(update={"seed": seed})
+    backbone = config.backbone.model_copy(update={"simulated": simulated})
+    return config.model_copy(update={"backbone": backbone})
 
 
 def with_decision(config: Config, robust: bool) -> Config:
@@ -131,48 +168,62 @@ def with_decision(config: Config, robust: bool) -> Config:
     return config.model_copy(update={"pose_graph": graph})
 
 
-def error_rows(results: Sequence[Result], shares: Sequence[float]) -> list[list[str]]:
-    """Return the table of ATE: header, sequences, means."""
-    ours = ["chained", *(f"{_case(case)}" for case in _cases(shares))]
-    header = ["seq", "km", "windows", "revisits", *ours, *PUBLISHED]
-    columns = [
-        [result.chained_m, *(result.outcomes[case].ate_m for case in _cases(shares))]
-        + [_published(row, result.name) for row in PUBLISHED.values()]
-        for result in results
-    ]
-    rows = [
-        [result.name, f"{result.path_m / 1e3:.2f}", str(result.windows), str(len(result.off))]
-        + [_number(value) for value in values]
-        for result, values in zip(results, columns, strict=True)
-    ]
-    for name, chosen in (
-        ("mean", [True] * len(results)),
-        (f"mean w/o {HIGHWAY}", [result.name != HIGHWAY for result in results]),
-    ):
-        if any(chosen):
-            means = np.mean(np.array(columns)[chosen], axis=0)
-            rows.append([name, "", "", "", *(_number(value) for value in means)])
-    return [header, *rows]
+def error_rows(results: Sequence[Sequence[Result]], shares: Sequence[float]) -> list[list[str]]:
+    """Return the table of ATE: header, sequences, means.
+
+    Args:
+        results: by sequence and seed; the table has the means over the seeds.
+        shares: of wrong closures.
+    """
+    cases = _cases(shares)
+    header = ["seq", "km", "windows", "revisits", "chained", *(_case(case) for case in cases)]
+    rows, errors = [], []
+    for seeds in results:
+        of_seeds = [[seed.chained_m, *(seed.outcomes[c].ate_m for c in cases)] for seed in seeds]
+        known = [_published(row, seeds[0].name) for row in PUBLISHED.values()]
+        errors.append([*np.mean(of_seeds, axis=0).tolist(), *known])
+        first = seeds[0]
+        facts = [first.name, f"{first.path_m / 1e3:.2f}", str(first.windows), str(len(first.off))]
+        rows.append([*facts, *map(_number, errors[-1])])
+    has_highway = np.array([seeds[0].name == HIGHWAY for seeds in results])
+    for name, chosen in (("mean", ~has_highway | True), (f"w/o {HIGHWAY}", ~has_highway)):
+        means = np.mean(np.array(errors)[chosen], axis=0).tolist() if chosen.any() else []
+        rows.append([f"{name} of {chosen.sum()}", "", "", "", *map(_number, means)])
+    return [[*header, *PUBLISHED], *rows]
 
 
-def closure_rows(results: Sequence[Result], shares: Sequence[float]) -> list[list[str]]:
-    """Return the table of closures and time: what is off, what is kept, what it took."""
-    robust = [case for case in _cases(shares) if case[1]]
-    header = ["seq", "frames", "off ° / m", "misfit σ"]
-    header += [f"{_case(case)}: right, wrong kept" for case in robust]
-    header += ["city s", "predict s", "chain s", "loop windows s", "optimise s"]
+def closure_rows(results: Sequence[Sequence[Result]], shares: Sequence[float]) -> list[list[str]]:
+    """Return the table of closures and time: what is off, what is kept, what it took.
+
+    Args:
+        results: by sequence and seed; closures are summed, errors are medians, times means.
+        shares: of wrong closures.
+    """
+    robust = [(share, True) for share in shares]
+    header = ["seq", "frames", "off ° / m", "misfit σ", *(f"kept, {_case(c)}" for c in robust)]
     rows = []
-    for result in results:
-        off = np.median(result.off, axis=0) if len(result.off) else [np.nan, np.nan]
-        first = result.outcomes[robust[0]]
-        row = [result.name, str(result.frames), f"{off[0]:.2f} / {off[1]:.2f}"]
-        row.append(_number(first.misfit))
-        for case in robust:
-            kept, given = result.outcomes[case].kept, result.outcomes[case].given
-            row.append(f"{kept[0]}/{given[0]}, {kept[1]}/{given[1]}")
-        row += [f"{result.seconds[key]:.1f}" for key in ("city", "predict", "register", "measure")]
-        rows.append([*row, " ".join(f"{result.outcomes[case].seconds:.1f}" for case in robust)])
-    return [header, *rows]
+    for seeds in results:
+        off = np.concatenate([seed.off for seed in seeds])
+        turn, move = np.median(off, axis=0) if len(off) else (np.nan, np.nan)
+        misfit = float(np.mean([seed.outcomes[robust[0]].misfit for seed in seeds]))
+        row = [seeds[0].name, str(seeds[0].frames), f"{_number(turn)} / {_number(move)}"]
+        row += [
+            _number(misfit),
+            *(_kept([seed.outcomes[case] for seed in seeds]) for case in robust),
+        ]
+        for name in TIMED.values():
+            row.append(f"{np.mean([seed.seconds.get(name, 0.0) for seed in seeds]):.1f}")
+        times = [np.mean([seed.outcomes[case].seconds for seed in seeds]) for case in robust]
+        rows.append([*row, " ".join(f"{mean:.1f}" for mean in times)])
+    return [[*header, *TIMED, "optimise s"], *rows]
+
+
+def _kept(outcomes: Sequence[Outcome]) -> str:
+    kept, given = (
+        np.sum([getattr(outcome, name) for outcome in outcomes], axis=0)
+        for name in ("kept", "given")
+    )
+    return f"{kept[0]}/{given[0]} right, {kept[1]}/{given[1]} wrong"
 
 
 def _cases(shares: Sequence[float]) -> list[Case]:
@@ -212,6 +263,7 @@ def main(  # noqa: PLR0913, PLR0917  (the options of a command)
     group: Annotated[int, typer.Option(min=1, help="wrong ones in a row that agree")] = 1,
     near: Annotated[float, typer.Option(help="metres between the cameras of a revisit")] = 4.0,
     angle: Annotated[float, typer.Option(help="degrees between their axes")] = 30.0,
+    seeds: Annotated[int, typer.Option(min=1, help="simulations to average over")] = 3,
     apart: Annotated[float, typer.Option(help="metres from one pair to the next")] = 25.0,
     assignments: Annotated[
         list[str] | None, typer.Option("--set", help="setting, such as windows.size=60")
@@ -222,7 +274,7 @@ def main(  # noqa: PLR0913, PLR0917  (the options of a command)
     try:
         config = load_config(assignments=[*SETTINGS, *(assignments or [])])
         shares = tuple(float(share) for share in wrong.split(","))
-        plan = Plan(shares, group, RevisitRule(near, angle, apart_m=apart))
+        plan = Plan(shares, group, RevisitRule(near, angle, apart_m=apart), seeds)
         files = [folder / f"{name}.txt" for name in only.split(",") if name]
         with Progress(console=Console(stderr=True)) as progress:
             files = files or sorted(folder.glob("*.txt"))
@@ -231,8 +283,14 @@ def main(  # noqa: PLR0913, PLR0917  (the options of a command)
     except LaserSlamError as error:
         typer.echo(f"simulate_loops: {error}", err=True)
         raise typer.Exit(1) from error
-    print_table(error_rows(results, shares), "ATE, m", markdown=markdown)
-    print_table(closure_rows(results, shares), "Closures; CPU seconds", markdown=markdown)
+    print_table(
+        error_rows(results, shares), f"ATE, m, mean of {seeds} simulations", markdown=markdown
+    )
+    print_table(
+        closure_rows(results, shares),
+        "Closures of all simulations; CPU seconds of one",
+        markdown=markdown,
+    )
 
 
 if __name__ == "__main__":
