@@ -25,8 +25,10 @@ _DEPTH_NOISE = 0.005  # of a depth, log; at least
 _DEPTH_GROUPS = 4  # by depth: far ones err more
 _REDESCEND = 25.0  # squared misfit, of 3 numbers in sigmas, from which a match has no say
 # What a pair of windows may be off as a whole, however well the matches agree: the pose of a frame
-# within its window (radians, median depths), and the unit of its depth (log).
-_TURN, _MOVE, _GROWTH = 3e-3, 4e-3, 0.02
+# within its window (radians, median depths), and the unit of its depth (log) where depths are as
+# uneven as those of networks; even ones have a surer unit.
+_TURN, _MOVE, _GROWTH = 2e-3, 3e-3, 0.02
+_NETWORK_NOISE = 0.06  # of the log-ratio of two depths
 _PAIRS_ALIKE = 5  # neighbouring pairs of images share the errors of their windows
 # Cells of direction and log depth, seen from the matched frame: what one object distorts.
 _CELLS = np.array([0.25, 0.25, 0.4])
@@ -222,7 +224,8 @@ def _covariance(points: Correspondences, a_from_b: Sim3, noise: _Noise, a: End) 
     inverse = np.linalg.pinv(hessian, rcond=_RANK, hermitian=True)
     # In one pair of images a single object may have most of the say on the scale.
     few = np.sqrt(_PAIRS_ALIKE / min(len(np.unique(points.pair)), _PAIRS_ALIKE))
-    whole = np.repeat([_TURN, _MOVE, few * _GROWTH], [3, 3, 1])
+    evenness = np.clip(float(np.median(noise.ratio)) / _NETWORK_NOISE, 0.1, 1)
+    whole = np.repeat([_TURN, _MOVE, few * evenness * _GROWTH], [3, 3, 1])
     units = np.repeat([1.0, _unit(points), 1.0], [3, 3, 1])
     at_pivot = units[:, None] * (inverse @ meat @ inverse + np.diag(whole**2)) * units
     carry = moved_by(a_from_b.translation, a_from_b.apply(_pivot(points)))
