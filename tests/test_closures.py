@@ -555,6 +555,14 @@ def anywhere(a: Array, b: Array) -> tuple[Array, Array]:
     return rng.uniform(0, (377, 111), (200, 2)), rng.uniform(0, (377, 111), (200, 2))
 
 
+def mirrored(a: Array, b: Array) -> tuple[Array, Array]:
+    return a, np.stack([377 - b[:, 0], b[:, 1]], axis=1)
+
+
+ONE_POINT = changed_matches(lambda a, b: (a * 0 + 50, b * 0 + 60))
+ONE_POINT_IN_B = changed_matches(lambda a, b: (a, b * 0 + 60))
+OUTSIDE = changed_matches(lambda a, b: (a + 1000, b))
+MIRRORED = changed_matches(mirrored)
 LEFT_MATCHES = changed_matches(left_half)
 RANDOM_MATCHES = changed_matches(anywhere)
 FEW_MATCHES = changed_matches(lambda a, b: (a[:3], b[:3]))
@@ -566,6 +574,10 @@ NO_MATCHES = changed_matches(lambda a, b: (a[:0], b[:0]))
     [
         (lambda end: end, NO_MATCHES, "the images have no matches"),
         (lambda end: end, RANDOM_MATCHES, "fit one similarity|agree on a pose"),
+        (lambda end: end, ONE_POINT, "no pair of images has 8 matches with depth that agree"),
+        (lambda end: end, ONE_POINT_IN_B, "no pair of images has 8 matches with depth that agree"),
+        (lambda end: end, OUTSIDE, "matches have depth at both ends, need 30"),
+        (lambda end: end, MIRRORED, "matches fit one similarity"),
         (lambda end: end, FEW_MATCHES, "matches have depth at both ends, need 30"),
         (lambda end: unknown(end, np.isfinite(end.prediction.depth)), MATCHER, "no depth"),
         (
@@ -577,7 +589,7 @@ NO_MATCHES = changed_matches(lambda a, b: (a[:0], b[:0]))
         ),
         (lambda end: replace(end, colors=end.colors * 0), MATCHER, "the images do not match"),
     ],
-    ids=["none", "random", "few", "unknown", "static", "black"],
+    ids="none random point point-in-b outside mirrored few unknown static black".split(),
 )
 def test_bad_input_is_a_verdict(
     network_ends: tuple[End, End], spoil: Callable[[End], End], matcher: Matcher, reason: str

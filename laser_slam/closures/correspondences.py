@@ -15,6 +15,7 @@ from laser_slam.sim3 import Array
 
 Rows = NDArray[np.int64]
 
+_NEAR = 0.01  # of the known depth: nearer points are in the camera, and project anywhere
 _EDGE = 1.15  # ratio of neighbouring depths beyond which a pixel lies on an edge
 
 
@@ -61,10 +62,10 @@ class Views:
 
         Returns:
             (P, 3): projection less pixel, x and y, and log of depth over known depth; infinite
-            behind the camera.
+            behind the camera, or all but in it.
         """
         cam = self.in_cam(points)
-        is_ahead = cam[:, 2] > 0
+        is_ahead = cam[:, 2] > _NEAR * self.depth
         z = np.where(is_ahead, cam[:, 2], 1.0)
         offset = self.focal * cam[:, :2] / z[:, None] + self.center - self.pixels
         out = np.concatenate([offset, np.log(z / self.depth)[:, None]], axis=1)

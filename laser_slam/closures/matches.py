@@ -156,7 +156,7 @@ def _linearise(
 
 def _projection_slopes(cam: Array, focal: Array) -> Array:
     """Return (P, 3, 3) how pixel x, y and log depth follow a point in camera axes."""
-    z = np.where(cam[:, 2] > 0, cam[:, 2], 1.0)
+    z = np.maximum(cam[:, 2], 1e-3 * np.linalg.norm(cam, axis=1) + np.finfo(np.float32).tiny)
     out = np.zeros((len(cam), 3, 3))
     for axis in (0, 1):
         out[:, axis, axis] = focal[:, axis] / z

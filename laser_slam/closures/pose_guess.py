@@ -82,10 +82,13 @@ def _locate(points: Views, seen: Views, width: int, config: ClosuresConfig) -> S
     options = {**_RANSAC, "max_reproj_error": max_error}
     pose, info = poselib.estimate_absolute_pose(seen.pixels, points.points / unit, camera, options)
     inliers: NDArray[np.bool_] = np.array(info["inliers"], np.bool_)
-    rotation, translation = orthonormal(np.asarray(pose.R)), unit * np.asarray(pose.t)
+    found = np.column_stack([pose.R, pose.t])
+    if not np.isfinite(found).all():  # of points in one place
+        return None
+    rotation, translation = orthonormal(found[:, :3]), unit * found[:, 3]
     depth = (points.points @ rotation.T + translation)[:, 2]
     inliers &= depth > 0
-    if inliers.sum() < MIN_POINTS // 2 or not np.isfinite(translation).all():
+    if inliers.sum() < MIN_POINTS // 2:
         return None
     scale = float(np.exp(np.median(np.log(depth[inliers] / seen.depth[inliers]))))
     cam_from_points = Sim3(1.0, rotation, translation)
