@@ -139,6 +139,11 @@ class PoseGraph:
         """
         self.add_link(_measured_link(a, b, a_from_b, sigmas), is_closure=True)
 
+    def drop_closure(self) -> None:
+        """Take the closure that was added last out again, as one that cannot be optimised."""
+        self._closures.pop()
+        self._left_out = self._left_out[:-1]
+
     def add_link(self, link: Link, *, is_closure: bool = False) -> None:
         """Add a link with its full information, as a g2o file has it.
 

@@ -154,12 +154,17 @@ class Slam:
             Whether the graph trusts it; an earlier closure may lose its trust by it.
 
         Raises:
-            DegenerateGeometryError: a sigma is not positive and finite.
+            DegenerateGeometryError: a window is unknown, a sigma is not positive and finite, or
+                the graph cannot be solved with it; all stays as it was.
         """
         with self._stage("optimise"):
             graph = self.pose_graph()
             graph.add_closure(a, b, a_from_b, sigmas)
-            self.optimised = graph.optimise()
+            try:
+                self.optimised = graph.optimise()
+            except DegenerateGeometryError:
+                graph.drop_closure()
+                raise
             places = self.optimised.world_from_window
             self.nodes = [
                 replace(node, world_from_window=places[node.index]) for node in self.nodes

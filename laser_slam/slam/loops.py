@@ -48,6 +48,7 @@ class LoopCloser:
         self._search = CandidateSearch(config.places, self._descriptor.size)
         self._waiting: tuple[Prediction, Image] | None = None
         self._travelled = 0.0
+        self._unit = 1.0  # median depth of the last window that had one
         self._records: list[ClosureRecord] = []
         self._closed: list[int] = []  # which of the records are in the graph, in its order
 
@@ -93,12 +94,16 @@ class LoopCloser:
             self._examine(candidate, prediction, colors)
 
     def _places(self, node: Node, prediction: Prediction) -> Iterator[Place]:
-        """Give the frames that a window owns, with the way to them in median depths."""
+        """Give the frames that a window owns, with the way to them in median depths.
+
+        A window that failed has poses in the unit of the one before.
+        """
         known = prediction.depth[:, ::4, ::4]
         known = known[known > 0]
-        unit = float(np.median(known)) if known.size else 1.0
+        if known.size:
+            self._unit = float(np.median(known))
         centers = node.window_from_cam[:, :3, 3]
-        steps = np.linalg.norm(np.diff(centers, axis=0, prepend=centers[:1]), axis=1) / unit
+        steps = np.linalg.norm(np.diff(centers, axis=0, prepend=centers[:1]), axis=1) / self._unit
         for row in np.flatnonzero(node.is_owned):
             self._travelled += float(steps[row])
             yield Place(int(node.frames[row]), node.index, self._travelled)
