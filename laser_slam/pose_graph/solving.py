@@ -173,14 +173,18 @@ def _surprises(problem: Problem, current: Fit) -> Array:
     """Return the (C,) squared misfits, in sigmas of closure and chain together; trusted: infinite.
 
     That is twice what a closure would add to the cost of a new fit: a closure may be far off only
-    because the windows that it links are not known better yet.
+    because the windows that it links are not known better yet. All are infinite where wrong
+    closures have tied the chain in knots that leave it no covariance.
     """
     out = np.full(len(problem.closures), np.inf)
     if current.is_trusted.all():
         return out
     gtsam = import_gtsam()
     graph = problem.graph(problem.weighted(current.is_trusted))
-    marginals = gtsam.Marginals(graph, current.values)
+    try:
+        marginals = gtsam.Marginals(graph, current.values)
+    except RuntimeError:  # what GTSAM raises for a singular system
+        return out
     for row in np.flatnonzero(~current.is_trusted).tolist():
         factor = problem.closures[row]
         keys = factor.keys()
