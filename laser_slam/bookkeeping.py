@@ -6,7 +6,7 @@ import logging
 import time
 import zlib
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,7 +16,12 @@ from laser_slam.errors import DatasetError, RunFolderError
 from laser_slam.types import Frame
 
 Item = TypeVar("Item")
+Progress = Callable[[str, int, int | None], None]
 logger = logging.getLogger(__name__)
+
+
+def no_progress(stage: str, done: int, total: int | None) -> None:
+    """Show nothing."""
 
 
 def identify(dataset: Dataset) -> dict[str, Any]:

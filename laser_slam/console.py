@@ -25,7 +25,7 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 from rich.text import Text
 
-from laser_slam.pipeline import Progress, no_progress
+from laser_slam.bookkeeping import Progress, no_progress
 
 SECONDS_BETWEEN_LINES = 10.0
 logger = logging.getLogger(__name__)
@@ -82,6 +82,8 @@ def summarize(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "windows", f"{windows['num']}{bridged}"
     if report["trajectory"]:
         yield from _summarize_trajectory(report["trajectory"])
+    if report["closures"]:
+        yield "loops", _loops_in_words(report["closures"])
     if report["depth"]:
         scores = report["depth"]["by_trajectory_scale"] or report["depth"]["by_median_ratio"]
         if scores["abs_rel"] is not None:
@@ -100,6 +102,14 @@ def _summarize_trajectory(errors: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if kitti["t_rel_percent"] is not None:
         turn = f"{kitti['r_rel_deg_per_100m']:.2f} deg/100 m"
         yield "t_rel, r_rel", f"{kitti['t_rel_percent']:.2f} %, {turn}"
+
+
+def _loops_in_words(closures: dict[str, Any]) -> str:
+    counts = f"{closures['accepted']} closed of {closures['candidates']} candidates"
+    without = closures["trajectory_without"]
+    if not closures["accepted"] or not without or without["reason"]:
+        return counts
+    return f"{counts}; ATE without them {without['ate_sim3_m']['rmse']:.3f} m"
 
 
 class _RateColumn(ProgressColumn):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
@@ -15,13 +15,18 @@ from numpy.typing import NDArray
 
 from laser_slam.backbones import make_backbone
 from laser_slam.backbones.base import Backbone
-from laser_slam.bookkeeping import FrameLog, StageClock, identify, run_log
+from laser_slam.bookkeeping import (
+    FrameLog,
+    Progress,
+    StageClock,
+    identify,
+    no_progress,
+    run_log,
+)
 from laser_slam.camera import resize_intrinsics
 from laser_slam.closures import Tools, make_matcher
 from laser_slam.config import Config
 from laser_slam.datasets.base import Dataset
-from laser_slam.evaluation.trajectory import evaluate_trajectory
-from laser_slam.export import write_ply
 from laser_slam.fusion import fuse
 from laser_slam.rectification import (
     Rectifier,
@@ -31,20 +36,18 @@ from laser_slam.rectification import (
 )
 from laser_slam.report import stages_picture
 from laser_slam.results import (
+    Findings,
     Results,
-    Scores,
     describe_layers,
+    describe_loops,
     describe_sequence,
-    draw_depth,
-    draw_layers,
-    draw_map,
-    draw_trajectory,
-    peak_memory_mib,
+    describe_system,
+    draw_findings,
+    look_back,
     sample_views,
     score_views,
-    versions,
+    write_findings,
     write_report,
-    write_trajectories,
 )
 from laser_slam.sim3 import interpolate_poses
 from laser_slam.slam import LoopCloser, Slam, StoredWindow, read_window
@@ -61,13 +64,8 @@ from laser_slam.types import (
 )
 from laser_slam.windows import cut_windows, select_keyframes
 
-Progress = Callable[[str, int, int | None], None]
 COMPLETE = "windows/complete"  # the mark that every window of the input has its file
 logger = logging.getLogger(__name__)
-
-
-def no_progress(stage: str, done: int, total: int | None) -> None:
-    """Show nothing."""
 
 
 class Pipeline:
@@ -142,9 +140,9 @@ class Pipeline:
             trajectory = self._trajectory()
             cloud = self._fuse()
             with self._clock.stage("evaluate"):
-                scores = self._score(trajectory)
-            self._write(trajectory, cloud, scores)
-            report = self._report(cloud, scores, warnings)
+                found = self._evaluate(trajectory, cloud)
+            self._write(found)
+            report = self._report(found, warnings)
             write_report(self.folder / "report.json", report)
         if self._is_named_here:
             link_latest(self.folder)
@@ -231,11 +229,11 @@ class Pipeline:
         self._intrinsics.append(resize_intrinsics(prediction.intrinsics[0], size, self._info.size))
         self._on_progress("mapping", len(self._input.times_s), self._info.num_frames)
 
-    def _trajectory(self) -> Trajectory:
+    def _trajectory(self, *, closed: bool = True) -> Trajectory:
         """Give every frame of the input a pose, those between keyframes by interpolation."""
         times_s = np.array(self._input.times_s)
         with self._clock.stage("trajectory"):
-            key = self._slam.trajectory(times_s)
+            key = self._slam.trajectory(times_s, closed=closed)
             world_from_cam = interpolate_poses(times_s, key.times_s, key.world_from_cam)
         return Trajectory(np.arange(len(times_s)), times_s, world_from_cam)
 
@@ -254,31 +252,30 @@ class Pipeline:
             logger.warning("the map is empty: nothing was seen with confidence")
         return cloud
 
-    def _score(self, trajectory: Trajectory) -> Scores:
-        """Compare with the truth, as far as there is one."""
-        views = list(sample_views(self._slam.nodes, self._load, self._config.run.samples))
-        truth, errors = self._info.truth, None
-        if truth is not None:
-            errors = evaluate_trajectory(trajectory, truth)
-        return score_views(views, errors, self._true_depth, self._config.fusion.min_confidence)
+    def _evaluate(self, trajectory: Trajectory, cloud: Cloud) -> Findings:
+        """Compare with the truth, as far as there is one, and with the run without its loops."""
+        truth, config = self._info.truth, self._config
+        views = list(sample_views(self._slam.nodes, self._load, config.run.samples))
+        least = config.fusion.min_confidence
+        scores = score_views(views, trajectory, truth, self._true_depth, least)
+        loops = None
+        if self._closer is not None:
+            loops = look_back(self._closer, self._slam, self._trajectory(closed=False), truth)
+        return Findings(trajectory, cloud, scores, loops, truth)
 
     def _true_depth(self, frame: int) -> NDArray[np.float32] | None:
         truth = self._dataset.true_depth(frame)
         return None if truth is None else self._rectifier.depth(truth)
 
-    def _write(self, trajectory: Trajectory, cloud: Cloud, scores: Scores) -> None:
+    def _write(self, found: Findings) -> None:
         with self._clock.stage("write"):
-            write_trajectories(self.folder, trajectory, self._info.truth)
-            write_ply(self.folder / "map.ply", cloud)
+            write_findings(self.folder, found, self._slam)
         with self._clock.stage("pictures"):
-            pictures = self.folder / "pictures"
-            draw_trajectory(pictures, trajectory, self._info.truth, scores.trajectory)
-            draw_map(pictures, trajectory, cloud)
-            draw_depth(pictures, scores.views)
-            draw_layers(pictures, scores.views, self._slam.nodes)
-        stages_picture(pictures / "stages.png", dict(self._clock.wall_s))
+            draw_findings(self.folder / "pictures", found, self._slam.nodes, self._files)
+        stages_picture(self.folder / "pictures" / "stages.png", dict(self._clock.wall_s))
 
-    def _report(self, cloud: Cloud, scores: Scores, warnings: list[str]) -> dict[str, Any]:
+    def _report(self, found: Findings, warnings: list[str]) -> dict[str, Any]:
+        scores, cloud = found.scores, found.cloud
         return {
             "sequence": describe_sequence(self._info, self._calibration, self._intrinsics),
             "frames": {**self._input.counts(), "keyframes": self._slam.num_keyframes},
@@ -287,11 +284,11 @@ class Pipeline:
             "depth": scores.depth,
             "depth_without_layers": scores.raw_depth,
             "layers": describe_layers(self._slam.nodes),
+            "closures": describe_loops(found.loops),
             "map": {"num_points": len(cloud.points), "voxel_size": cloud.voxel_size},
             "warnings": warnings,
             **self._clock.report(len(self._input.times_s)),
-            "peak_memory_mib": peak_memory_mib(),
-            "versions": versions(),
+            **describe_system(),
             "settings": self._config.model_dump(mode="json"),
         }
 

@@ -651,7 +651,7 @@ def test_a_run_over_all_that_may_happen_has_a_pose_for_every_frame(
     short_drive: RenderedDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The pipeline leaves out what stands and what is dark, so only the cut must be bridged."""
-    for name in ("draw_trajectory", "draw_map", "draw_depth", "stages_picture"):
+    for name in ("draw_findings", "stages_picture"):
         monkeypatch.setattr(laser_slam.pipeline, name, lambda *_: None)
     dataset = Eventful(eventful(short_drive), short_drive.intrinsics)
     settings = {"windows": {"size": 8, "overlap": 3}, "calibration": {"keyframes": 0}}

@@ -55,7 +55,7 @@ def known_backbones(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def cheap_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("draw_trajectory", "draw_map", "draw_depth", "stages_picture"):
+    for name in ("draw_findings", "stages_picture"):
         monkeypatch.setattr(f"laser_slam.pipeline.{name}", lambda *_: None)
 
 

@@ -175,9 +175,8 @@ class BendingBackbone(TrueBackbone):
 def no_pictures() -> Iterator[None]:
     """Leave out what takes seconds and is drawn in other tests."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("trajectory", "map", "depth", "layers"):
-            patch.setattr(laser_slam.pipeline, f"draw_{name}", lambda *_: None)
-        patch.setattr(laser_slam.pipeline, "stages_picture", lambda *_: None)
+        for name in ("draw_findings", "stages_picture"):
+            patch.setattr(laser_slam.pipeline, name, lambda *_: None)
         yield
 
 

@@ -35,7 +35,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Results:
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out what takes seconds and is drawn in other tests."""
-    for name in ("draw_trajectory", "draw_map", "draw_depth", "stages_picture"):
+    for name in ("draw_findings", "stages_picture"):
         monkeypatch.setattr(laser_slam.pipeline, name, lambda *_: None)
 
 

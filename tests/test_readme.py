@@ -23,7 +23,7 @@ def test_the_python_example_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Word by word, on images that lie where it expects them."""
-    for name in ("draw_trajectory", "draw_map", "draw_depth", "stages_picture"):
+    for name in ("draw_findings", "stages_picture"):
         monkeypatch.setattr(f"laser_slam.pipeline.{name}", lambda *_: None)
     monkeypatch.setitem(BACKBONES, "classical", f"{__name__}:true_backbone")
     monkeypatch.chdir(tmp_path)

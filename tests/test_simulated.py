@@ -583,7 +583,7 @@ def run_report(folder: Path, *settings: str) -> dict[str, object]:
 def test_a_whole_run_maps_the_corridor_and_says_what_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("draw_trajectory", "draw_map", "draw_depth", "stages_picture"):
+    for name in ("draw_findings", "stages_picture"):
         monkeypatch.setattr(f"laser_slam.pipeline.{name}", lambda *_: None)
     exact = run_report(
         tmp_path / "exact",

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from laser_slam.config import PlacesConfig
 from laser_slam.places.index import PlaceIndex
+from laser_slam.places.similarity import SimilarityMap, map_similarities
 
 Array32 = NDArray[np.float32]
 
@@ -118,6 +119,11 @@ class CandidateSearch:
         self._travelled = np.concatenate([self._travelled, travelled])
         self._proposed = [hit for hit in [*self._proposed, *chosen] if self._is_near(hit, places)]
         return chosen
+
+    def similarity_map(self) -> SimilarityMap:
+        """Return how much all keyframes so far resemble each other."""
+        frames = np.array([place.frame for place in self._places], np.int64)
+        return map_similarities(self._index, frames)
 
     def _is_near(self, hit: Candidate, places: Sequence[Place]) -> bool:
         """Tell whether a pair may still stand for one of the keyframes that follow ``places``."""

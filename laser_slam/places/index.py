@@ -44,6 +44,10 @@ class PlaceIndex:
         self._num = end
         self._sum += descriptors.sum(axis=0, dtype=np.float64)
 
+    def descriptors(self, positions: NDArray[np.int64]) -> Array32:
+        """Return (M, D) of what was inserted, by its position."""
+        return self._rows[positions].astype(np.float32)
+
     def similarities(self, descriptors: Array32, stop: int | None = None) -> Array32:
         """Compare (M, D) descriptors with the first ``stop`` inserted, None: all; (M, stop)."""
         stop = self._num if stop is None else min(stop, self._num)

@@ -195,17 +195,22 @@ class PoseGraph:
             log-scale.
 
         Raises:
-            DegenerateGeometryError: registrations leave a window unlinked.
+            DegenerateGeometryError: registrations leave a window unlinked, or rounding leaves no
+                covariance.
         """
         self._check_chain()
         gtsam = import_gtsam()
         graph = gtsam.NonlinearFactorGraph(self._chain)
         for factor in self._trusted():
             graph.push_back(factor)
-        marginals = gtsam.Marginals(graph, self._values)
+        try:
+            marginals = gtsam.Marginals(graph, self._values)
+            covariances = {index: marginals.marginalCovariance(index) for index in indices}
+        except RuntimeError as error:  # what GTSAM raises for a singular system
+            raise DegenerateGeometryError("the pose graph has no covariance") from error
         return {
-            index: parent_sigmas(self._place(index), marginals.marginalCovariance(index))
-            for index in indices
+            index: parent_sigmas(self._place(index), covariance)
+            for index, covariance in covariances.items()
         }
 
     def _place(self, index: int) -> Sim3:

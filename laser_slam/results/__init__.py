@@ -1,18 +1,13 @@
-"""What a finished run leaves: scores against the truth, files, pictures, the report."""
+"""What a run leaves: scores against the truth, files, pictures, the report."""
 
-from laser_slam.results.pictures import (
-    draw_depth,
-    draw_layers,
-    draw_map,
-    draw_trajectory,
-    write_trajectories,
-)
+from laser_slam.results.findings import Findings, draw_findings, write_findings
+from laser_slam.results.loops import Loops, describe_loops, look_back
+from laser_slam.results.pictures import draw_trajectory
 from laser_slam.results.report import (
     Results,
     describe_layers,
     describe_sequence,
-    peak_memory_mib,
-    versions,
+    describe_system,
     write_report,
 )
 from laser_slam.results.scores import (
@@ -23,19 +18,20 @@ from laser_slam.results.scores import (
 )
 
 __all__ = [
+    "Findings",
     "KeyframeView",
+    "Loops",
     "Results",
     "Scores",
     "describe_layers",
+    "describe_loops",
     "describe_sequence",
-    "draw_depth",
-    "draw_layers",
-    "draw_map",
+    "describe_system",
+    "draw_findings",
     "draw_trajectory",
-    "peak_memory_mib",
+    "look_back",
     "sample_views",
     "score_views",
-    "versions",
+    "write_findings",
     "write_report",
-    "write_trajectories",
 ]

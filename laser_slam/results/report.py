@@ -79,8 +79,12 @@ def write_report(path: Path, report: dict[str, Any]) -> None:
     write_text(path, json.dumps(_without_nan(report), indent=2, ensure_ascii=False) + "\n")
 
 
-def versions() -> dict[str, str]:
-    """Name what the results may depend on."""
+def describe_system() -> dict[str, Any]:
+    """Tell what the run needed of the computer, and what its results may depend on."""
+    return {"peak_memory_mib": _peak_memory_mib(), "versions": _versions()}
+
+
+def _versions() -> dict[str, str]:
     out = {"laser-slam": __version__, "python": platform.python_version()}
     for package in PACKAGES:
         try:
@@ -90,7 +94,7 @@ def versions() -> dict[str, str]:
     return {**out, "system": platform.platform()}
 
 
-def peak_memory_mib() -> float | None:
+def _peak_memory_mib() -> float | None:
     """Return the largest memory that this process had so far; None where the system can't tell."""
     try:
         import resource  # noqa: PLC0415  (not on every system)

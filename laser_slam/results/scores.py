@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.evaluation.depth import evaluate_depth
-from laser_slam.evaluation.trajectory import TrajectoryErrors
+from laser_slam.evaluation.trajectory import TrajectoryErrors, evaluate_trajectory
 from laser_slam.slam import Node, StoredWindow
-from laser_slam.types import Image
+from laser_slam.types import Image, Trajectory
 
 Labels = NDArray[np.uint16]
 
@@ -88,25 +88,28 @@ def sample_views(nodes: Sequence[Node], load: Load, num: int) -> Iterator[Keyfra
 
 def score_views(
     views: Sequence[KeyframeView],
-    trajectory: TrajectoryErrors | None,
+    trajectory: Trajectory,
+    truth: Trajectory | None,
     true_depth: Callable[[int], NDArray[np.float32] | None],
     min_confidence: float,
 ) -> Scores:
-    """Compare the depth of keyframes with the truth, with and without the layers' scales.
+    """Compare poses, and the depth of keyframes with and without the layers' scales.
 
     Args:
         views: keyframes of the run.
-        trajectory: errors of the poses, whose scale gives metres; None: there is no truth.
+        trajectory: the poses of all frames.
+        truth: poses in metres; None: there is none.
         true_depth: gives a frame's (H, W) truth in metres, or None.
         min_confidence: pixels below it are not compared.
     """
-    metres_per_unit = trajectory.scale if trajectory else None
+    errors = None if truth is None else evaluate_trajectory(trajectory, truth)
+    metres_per_unit = errors.scale if errors else None
     depth = score_depth(views, true_depth, metres_per_unit, min_confidence)
     raw = None
     if any(view.labels is not None for view in views):
         as_predicted = [replace(view, depth=view.raw_depth) for view in views]
         raw = score_depth(as_predicted, true_depth, metres_per_unit, min_confidence)
-    return Scores(trajectory, depth, raw, views)
+    return Scores(errors, depth, raw, views)
 
 
 def score_depth(

@@ -188,17 +188,21 @@ class Slam:
         """
         return spread_corrections([node.moved for node in self.nodes])
 
-    def trajectory(self, times_s: Array) -> Trajectory:
+    def trajectory(self, times_s: Array, *, closed: bool = True) -> Trajectory:
         """Return the pose of every keyframe, each from the window that owns it.
 
         Args:
             times_s: seconds of the sequence's frames, by frame index.
+            closed: False: as the registrations alone chain the windows, without closures.
 
         Returns:
             ``world_from_cam`` of the keyframes, in world units.
         """
         owned = np.concatenate([node.frames[node.is_owned] for node in self.nodes])
-        world_from_cam = spread_poses([node.moved for node in self.nodes])
+        windows = [node.moved for node in self.nodes]
+        if not closed:
+            windows = [replace(window, after=window.before) for window in windows]
+        world_from_cam = spread_poses(windows)
         return Trajectory(owned, times_s[owned], world_from_cam)
 
     def _align_layers(self, placed: Prediction, colors: Image) -> None:

@@ -13,6 +13,7 @@ from laser_slam.closures import CandidateEnds, ClosureRecord, End, Tools, judge
 from laser_slam.config import Config
 from laser_slam.errors import DegenerateGeometryError
 from laser_slam.places import Candidate, CandidateSearch, Place, make_descriptor
+from laser_slam.places.similarity import SimilarityMap
 from laser_slam.slam.chain import Slam
 from laser_slam.slam.node import Node
 from laser_slam.slam.stored import read_window
@@ -66,6 +67,16 @@ class LoopCloser:
                 verdict = f"the pose graph distrusts it, {misfit:.1f} sigmas off"
                 records[row] = replace(records[row], verdict=verdict)
         return records
+
+    @property
+    def num_distrusted(self) -> int:
+        """Count the closures that passed all checks and were left out by the pose graph."""
+        optimised = self._slam.optimised
+        return 0 if optimised is None else int((~optimised.is_trusted).sum())
+
+    def similarity_map(self) -> SimilarityMap:
+        """Return how much all keyframes so far resemble each other."""
+        return self._search.similarity_map()
 
     def add(self, prediction: Prediction, colors: Image) -> None:
         """Look at the window before the one that was added last.
