@@ -50,6 +50,24 @@ def import_gtsam() -> Any:
     return gtsam
 
 
+@cache
+def import_torch() -> Any:
+    """Import PyTorch, which only networks need and a plain installation lacks.
+
+    Raises:
+        DependencyError: PyTorch is missing or cannot be loaded; says how to get it.
+    """
+    try:
+        import torch  # noqa: PLC0415  (seconds, and only networks need it)
+    except (ImportError, OSError) as error:
+        raise DependencyError(
+            f"PyTorch cannot be loaded ({error}); install it: pip install 'laser-slam[networks]' "
+            "(without a GPU, a much smaller one: --extra-index-url "
+            "https://download.pytorch.org/whl/cpu)"
+        ) from error
+    return torch
+
+
 def _preload_libusb() -> None:
     try:
         import libusb_package  # noqa: PLC0415

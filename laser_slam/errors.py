@@ -17,6 +17,10 @@ class RunFolderError(LaserSlamError):
     """The output folder cannot be used or written."""
 
 
+class WeightsError(LaserSlamError):
+    """The weights of a network are missing, unreadable or those of another network."""
+
+
 class DependencyError(LaserSlamError):
     """A package or a system library that is needed for this is not installed."""
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parents[1] / "laser_slam"
-ROOTS = ["errors", "dependencies", "sim3", "camera", "types", "config", "store"]
+ROOTS = ["errors", "dependencies", "sim3", "camera", "types", "config", "store", "networks"]
 STAGES = [
     "datasets",
     "windows",
@@ -20,7 +20,8 @@ STAGES = [
 STAGES += ["viewer", "report", "layers", "places", "pose_graph"]
 COMPOSITION = ["closures", "slam", "bookkeeping", "results", "rescoring", "pipeline"]
 COMPOSITION += ["console", "cli"]
-HEAVY = {"open3d", "torch", "gtsam", "numba", "cv2", "matplotlib", "scipy"}
+TORCH = {"torch", "safetensors"}  # no dependencies of a plain installation
+HEAVY = {"open3d", *TORCH, "gtsam", "numba", "cv2", "matplotlib", "scipy"}
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 
@@ -53,7 +54,7 @@ def test_imports_point_up_and_stages_do_not_meet(path: Path) -> None:
     assert used <= may_import(part)
 
 
-@pytest.mark.parametrize("name", [*ROOTS, "cli"])
+@pytest.mark.parametrize("name", [*ROOTS[:-1], "cli"])
 def test_the_command_line_starts_without_heavy_packages(name: str) -> None:
     single, package = PACKAGE / f"{name}.py", sorted((PACKAGE / name).glob("*.py"))
     paths = [single] if single.exists() else package
@@ -64,6 +65,15 @@ def test_the_command_line_starts_without_heavy_packages(name: str) -> None:
         for module in imported_modules(path, top_level_only=True)
     }
     assert not names & HEAVY
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_networks_and_torch_are_imported_on_use(path: Path) -> None:
+    if part_of(path) == "networks":
+        return
+    names = imported_modules(path, top_level_only=True)
+    assert not {name.split(".")[0] for name in names} & TORCH
+    assert not [name for name in names if name.startswith("laser_slam.networks")]
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))

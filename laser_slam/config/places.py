@@ -30,6 +30,10 @@ class PlacesConfig(Section):
     """Keyframes that may show a place seen before, and their check."""
 
     descriptor: str = Field("vlad", description="one of the names in laser_slam.places.DESCRIPTORS")
+    salad_weights: str = Field("", description="weights file of 'salad', dino_salad.ckpt")
+    salad_size: int = Field(
+        336, ge=126, multiple_of=14, description="side of the square that 'salad' looks at, px"
+    )
     width: int = Field(640, ge=160, description="wider images are reduced before description, px")
     num_features: int = Field(800, ge=50, description="features that a description sums up")
     min_similarity: float = Field(

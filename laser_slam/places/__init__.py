@@ -27,7 +27,10 @@ __all__ = [
     "verify",
 ]
 
-DESCRIPTORS = {"vlad": "laser_slam.places.vlad:VladDescriptor"}
+DESCRIPTORS = {
+    "vlad": "laser_slam.places.vlad:VladDescriptor",
+    "salad": "laser_slam.places.salad:SaladDescriptor",
+}
 """Name in the settings -> ``module:Class``, imported on use."""
 
 

@@ -1,0 +1,220 @@
+"""The image encoder that SALAD, pi3 and VGGT share: a DINOv2 vision transformer.
+
+Modules carry the names of the released checkpoints, so that no key needs a mapping: below
+``backbone.model.`` of SALAD's, ``encoder.`` of pi3's and ``aggregator.patch_embed.`` of VGGT's.
+The ``mask_token`` that some of them hold serves training only and has no place here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+IMAGE_MEAN = (0.485, 0.456, 0.406)  # of ImageNet: red, green, blue in [0, 1]
+IMAGE_STD = (0.229, 0.224, 0.225)
+PATCH = 14  # side, px
+NORM_EPS = 1e-6
+EXTRA = 0.1  # cells; part of the factor by which 'factor' resamples
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """The shape of an encoder, and how it places images that are not of its training size.
+
+    Attributes:
+        width: channels D of a token.
+        depth: number of blocks.
+        num_heads: of the attention; they share the width.
+        num_registers: extra tokens between the class token and the patches.
+        grid: side of the table of positions, in patches.
+        resampling: of that table. 'size': to the image's grid, smoothed (pi3, VGGT); 'factor': by
+            (cells + 0.1) / grid, not smoothed (the first DINOv2, thus SALAD). A network is right
+            with the one that it was trained with only.
+    """
+
+    width: int
+    depth: int
+    num_heads: int
+    num_registers: int = 0
+    grid: int = 37
+    resampling: Literal["size", "factor"] = "size"
+
+
+BASE = EncoderConfig(768, 12, 12, resampling="factor")  # ViT-B/14
+LARGE_WITH_REGISTERS = EncoderConfig(1024, 24, 16, num_registers=4)  # ViT-L/14
+
+
+class Tokens(NamedTuple):
+    """What the encoder says of B images.
+
+    Attributes:
+        image: (B, D) of the class token.
+        patches: (B, h w, D), row by row, of the patches.
+    """
+
+    image: Tensor
+    patches: Tensor
+
+
+class Encoder(nn.Module):
+    """A vision transformer with registers and scaled residual branches.
+
+    Reference: Oquab et al., DINOv2 (arXiv:2304.07193); Darcet et al. (arXiv:2309.16588, registers).
+    """
+
+    def __init__(self, config: EncoderConfig) -> None:
+        """Build the encoder with zeros for weights, which are to be loaded."""
+        super().__init__()
+        width = config.width
+        self.config = config
+        self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
+        self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.grid**2, width))
+        if config.num_registers:
+            self.register_tokens = nn.Parameter(torch.zeros(1, config.num_registers, width))
+        self.patch_embed = PatchEmbedding(width)
+        self.blocks = nn.ModuleList(Block(width, config.num_heads) for _ in range(config.depth))
+        self.norm = nn.LayerNorm(width, eps=NORM_EPS)
+
+    def forward(self, images: Tensor) -> Tokens:
+        """Encode images of one size.
+
+        Args:
+            images: (B, 3, H, W) RGB in [0, 1]; H and W are multiples of ``PATCH``.
+
+        Returns:
+            Normalised tokens, in the dtype of the weights or of a surrounding autocast.
+
+        Raises:
+            ValueError: H or W is no multiple of ``PATCH``.
+        """
+        tokens = self.embed(images)
+        for block in self.blocks:
+            tokens = block(tokens)
+        tokens = self.norm(tokens)
+        return Tokens(tokens[:, 0], tokens[:, 1 + self.config.num_registers :])
+
+    def embed(self, images: Tensor) -> Tensor:
+        """Return the (B, 1 + registers + h w, D) tokens that go into the first block."""
+        height, width = images.shape[-2:]
+        if height % PATCH or width % PATCH:
+            raise ValueError(f"images of {width}x{height} px; sides must be multiples of {PATCH}")
+        patches = self.patch_embed(images)
+        tokens = torch.cat([self.cls_token.expand(len(images), -1, -1).to(patches), patches], dim=1)
+        tokens = tokens + self.positions(height // PATCH, width // PATCH).to(tokens)
+        if not self.config.num_registers:
+            return tokens
+        registers = self.register_tokens.expand(len(images), -1, -1).to(tokens)
+        return torch.cat([tokens[:, :1], registers, tokens[:, 1:]], dim=1)
+
+    def positions(self, rows: int, columns: int) -> Tensor:
+        """Return the (1, 1 + rows columns, D) table of positions, the class token's first."""
+        grid = self.config.grid
+        if rows == columns == grid:
+            return self.pos_embed
+        table = self.pos_embed.float()
+        square = table[:, 1:].transpose(1, 2).reshape(1, -1, grid, grid)
+        resampled = self._resample(square, rows, columns).flatten(2).transpose(1, 2)
+        return torch.cat([table[:, :1], resampled], dim=1)
+
+    def _resample(self, square: Tensor, rows: int, columns: int) -> Tensor:
+        """Resample (1, D, grid, grid) to (1, D, rows, columns)."""
+        if self.config.resampling == "size":
+            return functional.interpolate(
+                square, size=(rows, columns), mode="bicubic", antialias=True
+            )
+        factors = ((rows + EXTRA) / self.config.grid, (columns + EXTRA) / self.config.grid)
+        return functional.interpolate(square, scale_factor=factors, mode="bicubic")
+
+
+class PatchEmbedding(nn.Module):
+    """A token for each patch of an image, from its pixels alone."""
+
+    def __init__(self, width: int) -> None:
+        """Build it for tokens of ``width`` channels."""
+        super().__init__()
+        self.proj = nn.Conv2d(3, width, PATCH, stride=PATCH)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return (B, h w, D) tokens, row by row, of (B, 3, H, W) images in [0, 1]."""
+        maps: Tensor = self.proj(normalise(images).to(self.proj.weight.dtype))
+        return maps.flatten(2).transpose(1, 2)
+
+
+class Block(nn.Module):
+    """Attention, then a two-layer perceptron; each adds its scaled result to the tokens."""
+
+    def __init__(self, width: int, num_heads: int) -> None:
+        """Build a block for tokens of ``width`` channels."""
+        super().__init__()
+        self.norm1 = nn.LayerNorm(width, eps=NORM_EPS)
+        self.attn = Attention(width, num_heads)
+        self.ls1 = LayerScale(width)
+        self.norm2 = nn.LayerNorm(width, eps=NORM_EPS)
+        self.mlp = Perceptron(width)
+        self.ls2 = LayerScale(width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Return (B, T, D) tokens for (B, T, D)."""
+        tokens = tokens + self.ls1(self.attn(self.norm1(tokens)))
+        out: Tensor = tokens + self.ls2(self.mlp(self.norm2(tokens)))
+        return out
+
+
+class Attention(nn.Module):
+    """Attention of all tokens of an image to one another, in fused form."""
+
+    def __init__(self, width: int, num_heads: int) -> None:
+        """Build it for tokens of ``width`` channels, which the heads share."""
+        super().__init__()
+        self.num_heads = num_heads
+        self.qkv = nn.Linear(width, 3 * width)
+        self.proj = nn.Linear(width, width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Return (B, T, D) for (B, T, D)."""
+        batch, length, width = tokens.shape
+        channels = width // self.num_heads
+        heads = self.qkv(tokens).view(batch, length, 3, self.num_heads, channels)
+        query, key, value = heads.permute(2, 0, 3, 1, 4)
+        mixed = functional.scaled_dot_product_attention(query, key, value)
+        out: Tensor = self.proj(mixed.transpose(1, 2).flatten(2))
+        return out
+
+
+class Perceptron(nn.Module):
+    """Two layers, four times as wide between them."""
+
+    def __init__(self, width: int) -> None:
+        """Build it for tokens of ``width`` channels."""
+        super().__init__()
+        self.fc1 = nn.Linear(width, 4 * width)
+        self.fc2 = nn.Linear(4 * width, width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Return (B, T, D) for (B, T, D)."""
+        out: Tensor = self.fc2(functional.gelu(self.fc1(tokens)))
+        return out
+
+
+class LayerScale(nn.Module):
+    """A learnt factor for each channel."""
+
+    def __init__(self, width: int) -> None:
+        """Start from zero: the factors are to be loaded."""
+        super().__init__()
+        self.gamma = nn.Parameter(torch.zeros(width))
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Return (..., D) for (..., D)."""
+        return tokens * self.gamma
+
+
+def normalise(images: Tensor) -> Tensor:
+    """Return (..., 3, H, W) in [0, 1] as the networks were trained: ImageNet's mean and spread."""
+    mean = torch.tensor(IMAGE_MEAN, device=images.device).view(3, 1, 1)
+    std = torch.tensor(IMAGE_STD, device=images.device).view(3, 1, 1)
+    return (images - mean) / std

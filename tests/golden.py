@@ -1,0 +1,128 @@
+"""Weights and images drawn from names alone, and what the original networks make of them.
+
+A weight is a function of its name and shape: raw bits of PCG64, seeded with the name's crc32; four
+16-bit parts of each word are summed (bell-shaped), scaled to unit variance and to what keeps
+activations of order one. Streams into layer norms stay near 0.03, so that a wrong epsilon shows.
+The values are the same on every machine; ``fingerprints`` of the manifests say so.
+"""
+
+import json
+import math
+import re
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+DATA = Path(__file__).parent / "data" / "golden"
+TOLERANCE = 2e-5  # of the largest magnitude
+STREAM = 0.03  # of what feeds a layer norm
+CENTRE = np.float32(4 * 65535 // 2)  # of a sum of four
+UNIT = 1.0 / math.sqrt(4 * (65536.0**2 - 1) / 12)
+
+# The first pattern that fits wins. 'mul': scale / sqrt(fan in) for weights of two or more
+# dimensions, 0.02 scale for others; 'one': scale (1 + 0.1 noise); 'raw': scale.
+RULES = [
+    (r"(pos_embed|cls_token|mask_token|register_tokens)$", "raw", STREAM),
+    (r"(^|\.)patch_embed\.proj\.(weight|bias)$", "mul", STREAM),
+    (r"^(encoder|aggregator\.patch_embed)\.norm\.weight$", "one", STREAM),
+    (r"^(encoder|aggregator\.patch_embed)\.norm\.bias$", "raw", 0.02 * STREAM),
+    (r"\.gamma$", "one", 0.25 * STREAM),
+    (r"(^|\.)aggregator\.score\.3\.weight$", "mul", 2.0),
+]
+
+
+class Case(NamedTuple):
+    """Images and what the original made of them."""
+
+    images: torch.Tensor  # (N, 3, H, W) in [0, 1]
+    stride: int  # every so many-th token was kept
+    expected: dict[str, Array]
+
+
+def load_manifest(model: str) -> dict[str, Any]:
+    return dict(json.loads((DATA / model / "manifest.json").read_text()))
+
+
+def load_case(model: str, name: str) -> Case:
+    meta = json.loads((DATA / model / f"case_{name}.json").read_text())
+    count = meta["batch"] * meta.get("frames", 1)
+    images = make_images(meta["seed"], count, meta["height"], meta["width"])
+    with np.load(DATA / model / f"case_{name}.npz", allow_pickle=False) as file:
+        expected = {key: file[key] for key in file.files}
+    return Case(torch.from_numpy(images), meta.get("token_stride", 1), expected)
+
+
+def relative_difference(found: torch.Tensor, expected: Array) -> float:
+    """Return the largest difference, over the largest magnitude."""
+    assert tuple(found.shape) == expected.shape
+    difference = found.detach().double().numpy() - expected.astype(np.float64)
+    return float(np.abs(difference).max() / np.abs(expected).max())
+
+
+def make_tensors(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:
+    return {name: torch.from_numpy(make_weights(name, shape)) for name, shape in shapes.items()}
+
+
+def fill(module: torch.nn.Module, prefix: str = "") -> None:
+    """Fill all parameters in place; ``prefix`` and their names are those of the original."""
+    with torch.no_grad():
+        for name, parameter in module.named_parameters():
+            parameter.copy_(torch.from_numpy(make_weights(prefix + name, list(parameter.shape))))
+
+
+def make_weights(name: str, shape: list[int]) -> Array:
+    kind, scale = _kind_and_scale(name, shape)
+    noise = _noise(name, math.prod(shape))
+    if kind == "mul":
+        values = noise * np.float32(scale * UNIT / math.sqrt(math.prod(shape[1:])))
+    elif kind == "one":
+        values = np.float32(scale) + noise * np.float32(0.1 * scale * UNIT)
+    else:
+        values = noise * np.float32(scale * UNIT)
+    return np.asarray(values, np.float32).reshape(shape)
+
+
+def make_images(seed: int, count: int, height: int, width: int) -> Array:
+    """Return (count, 3, height, width) smooth-plus-noise frames in [0, 1]."""
+    cell = 14
+    rows, columns = -(-height // cell), -(-width // cell)
+    coarse = _unit_noise(f"image-coarse-{seed}", (count, 3, rows, columns))
+    frame = _unit_noise(f"image-frame-{seed}", (count, 3, 1, 1))
+    fine = _unit_noise(f"image-fine-{seed}", (count, 3, height, width))
+    smooth = coarse.repeat(cell, axis=2).repeat(cell, axis=3)[:, :, :height, :width]
+    parts = (np.float32(0.12) * frame, np.float32(0.12) * smooth, np.float32(0.08) * fine)
+    out = np.float32(0.5) + parts[0] + parts[1] + parts[2]
+    return np.asarray(np.clip(out, np.float32(0), np.float32(1)), np.float32)
+
+
+def fingerprint(name: str, shape: list[int]) -> str:
+    return f"{zlib.crc32(np.ascontiguousarray(make_weights(name, shape)).tobytes()):08x}"
+
+
+def _kind_and_scale(name: str, shape: list[int]) -> tuple[str, float]:
+    is_matrix = name.endswith("weight") and len(shape) > 1
+    for pattern, kind, scale in RULES:
+        if re.search(pattern, name):
+            return ("raw", 0.02 * scale) if kind == "mul" and not is_matrix else (kind, scale)
+    if is_matrix:
+        return "mul", 1.0
+    if name.endswith("bias"):
+        return "raw", 0.02
+    return ("one", 1.0) if name.endswith("weight") or not shape else ("raw", 1.0)
+
+
+def _unit_noise(name: str, shape: tuple[int, ...]) -> Array:
+    return (_noise(name, math.prod(shape)) * np.float32(UNIT)).reshape(shape)
+
+
+def _noise(name: str, count: int) -> Array:
+    """Return integers around 0 as float32, each the sum of the parts of a 64-bit word."""
+    words = np.random.PCG64(zlib.crc32(name.encode())).random_raw(count)
+    parts = np.asarray(words, "<u8").view("<u2").reshape(-1, 4)
+    return np.asarray(parts.sum(axis=1, dtype=np.uint32).astype(np.float32) - CENTRE)
