@@ -171,7 +171,8 @@ class Pipeline:
     def _make_closer(self) -> LoopCloser | None:
         if not self._config.closures.enabled:
             return None
-        tools = Tools(make_matcher(self._config.places.verification), self.backbone)
+        matcher = make_matcher(self._config.places.verification)
+        tools = Tools(matcher, self.backbone, self._rectifier.intrinsics)
         return LoopCloser(self._config, self._slam, self._files, tools)
 
     def _first_windows(self) -> Iterator[Window]:
@@ -212,7 +213,7 @@ class Pipeline:
                 )
             with self._clock.stage("store"):
                 colors = reduce_images(window.images, prediction.depth.shape[1:])
-                prediction = self._files.save(window.index, prediction, colors)
+                prediction, colors = self._files.save(window.index, prediction, colors)
         for warning in prediction.warnings:
             logger.warning("window %d: %s", window.index, warning)
         return prediction, colors

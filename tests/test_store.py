@@ -90,10 +90,11 @@ def test_a_window_without_depth_survives(tmp_path: Path) -> None:
 
 
 def test_what_saving_returns_is_what_loading_gives(tmp_path: Path) -> None:
-    returned = save_prediction(tmp_path / "0.npz", a_prediction(), a_street())
-    read, _ = load_prediction(tmp_path / "0.npz")
+    returned, colors = save_prediction(tmp_path / "0.npz", a_prediction(), a_street())
+    read, read_colors = load_prediction(tmp_path / "0.npz")
     assert np.array_equal(returned.depth, read.depth, equal_nan=True)
     assert np.array_equal(returned.confidence, read.confidence)
+    assert np.array_equal(colors, read_colors)
 
 
 def test_a_frame_takes_less_than_half_a_megabyte(tmp_path: Path) -> None:

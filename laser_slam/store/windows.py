@@ -25,7 +25,7 @@ JPEG_QUALITY = 85
 _DAMAGE = (OSError, ValueError, KeyError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
 
 
-def save_prediction(path: Path, prediction: Prediction, colors: Image) -> Prediction:
+def save_prediction(path: Path, prediction: Prediction, colors: Image) -> tuple[Prediction, Image]:
     """Write one window without pickle: the cache, the resume point and the replay's input.
 
     Depth is kept to a relative 5e-4, confidence in steps of 1/255, colours as JPEG; poses and
@@ -37,23 +37,19 @@ def save_prediction(path: Path, prediction: Prediction, colors: Image) -> Predic
         colors: (N, H, W, 3) RGB uint8, at the size of the depth maps.
 
     Returns:
-        The prediction as ``load_prediction`` gives it back, so that a run that goes on with it
-        ends as one that was broken off and resumed.
+        Both as ``load_prediction`` gives them back, so that a run that goes on with them ends as
+        one that was broken off and resumed.
 
     Raises:
         RunFolderError: the system could not write.
     """
     packed = _pack(prediction)
     jpegs = [_encode_jpeg(image) for image in colors]
+    jpeg = np.frombuffer(b"".join(jpegs), np.uint8)
+    sizes = np.array([len(each) for each in jpegs], np.int64)
     with atomic_write(path) as partial, partial.open("wb") as file:
-        np.savez(
-            file,
-            allow_pickle=False,
-            **packed,
-            jpeg=np.frombuffer(b"".join(jpegs), np.uint8),
-            jpeg_sizes=np.array([len(jpeg) for jpeg in jpegs], np.int64),
-        )
-    return _unpack(packed)
+        np.savez(file, allow_pickle=False, **packed, jpeg=jpeg, jpeg_sizes=sizes)
+    return _unpack(packed), _decode_jpegs(jpeg, sizes)
 
 
 def load_prediction(path: Path) -> tuple[Prediction, Image]:
@@ -111,7 +107,7 @@ class WindowFiles:
         """Tell whether a window was predicted before."""
         return self._path("windows", index).exists()
 
-    def save(self, index: int, prediction: Prediction, colors: Image) -> Prediction:
+    def save(self, index: int, prediction: Prediction, colors: Image) -> tuple[Prediction, Image]:
         """Write a window; see ``save_prediction``."""
         return save_prediction(self._path("windows", index), prediction, colors)
 
