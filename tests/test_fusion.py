@@ -152,6 +152,24 @@ def test_frames_of_the_overlap_are_not_doubled() -> None:
     np.testing.assert_allclose(whole.points, once.points, atol=1e-6)
 
 
+def test_each_frame_goes_where_its_own_place_says() -> None:
+    """Closures have bent the chain: the frames of one window differ in turn, move and scale."""
+    submap, rng = submap_of(wavy_depth(4)), np.random.default_rng(3)
+    places = tuple(
+        Sim3(1 + 0.3 * rng.random(), rotation_exp(0.3 * rng.normal(size=3)), rng.normal(size=3))
+        @ submap.world_from_window
+        for _ in range(4)
+    )
+    bent = fuse([replace(submap, places=places)], EVERYTHING)
+    one_by_one = [
+        replace(submap, world_from_window=place, is_owned=np.arange(4) == i)
+        for i, place in enumerate(places)
+    ]
+    expected = fuse(one_by_one, EVERYTHING)
+    np.testing.assert_array_equal(bent.points, expected.points)
+    assert len(bent.points) != len(fuse([submap], EVERYTHING).points)
+
+
 @pytest.mark.parametrize("unit", [0.01, 100.0])
 def test_the_unit_of_the_windows_changes_nothing(unit: float) -> None:
     config = FusionConfig(min_confidence=0.3, min_observations=2, max_range=1.3)
