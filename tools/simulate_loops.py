@@ -70,12 +70,7 @@ PUBLISHED = {
 }
 # fmt: on
 # Columns of CPU seconds, and what they were charged to.
-TIMED = {
-    "city s": "city",
-    "windows s": "predict",
-    "chain s": "register",
-    "loop windows s": "measure",
-}
+TIMED = {"city s": "city", "windows s": "predict", "chain s": "register", "loops s": "measure"}
 Case = tuple[float, bool]  # share of wrong closures, robust decision
 
 
@@ -144,8 +139,14 @@ def simulate(poses: Path, config: Config, plan: Plan, progress: Progress) -> lis
         counts = len(chained.truth.frames), len(chained.slam.nodes)
         errors = chained.path_m, chained.ate_m(chained.slam)
         results.append(Result(poses.stem, *counts, *errors, off, outcomes, times))
+        progress.console.print(_line(results[-1], seed), soft_wrap=True)
     progress.remove_task(task)
     return results
+
+
+def _line(result: Result, seed: int) -> str:
+    errors = ", ".join(f"{_case(case)} {o.ate_m:.2f}" for case, o in result.outcomes.items())
+    return f"{result.name}, seed {seed}: ATE chained {result.chained_m:.2f} m, {errors}"
 
 
 def _wrong(
