@@ -60,7 +60,9 @@ def test_the_run_folder_holds_all_that_was_promised(whole: Results) -> None:
     names = {str(path.relative_to(whole.folder)) for path in whole.folder.rglob("*")}
     pictures = ["trajectory", "drift", "map_above", "map_bird", "map_driver", "depth", "stages"]
     assert names >= {f"pictures/{name}.png" for name in pictures}
+    assert names >= {"pictures/similarity.png", "pictures/scales.png"}
     assert names >= {"config.yaml", "run.log", "report.json", "map.ply", "windows/000000.npz"}
+    assert names >= {"closures.json", "graph.g2o"}
     assert not [name for name in names if "partial" in name]
     assert load_config(file=whole.folder / "config.yaml") == CONFIG
 
@@ -83,6 +85,22 @@ def test_the_report_names_times_memory_calibration_and_settings(whole: Results) 
     assert report["sequence"]["intrinsics_source"] == "the corridor's plan"
     assert report["sequence"]["intrinsics"]["fx"] == pytest.approx(76.27, abs=0.01)
     assert report["settings"]["windows"]["size"] == 8
+
+
+def test_a_run_that_looks_for_no_loops_says_so_and_leaves_no_files_of_them(
+    tmp_path: Path, no_pictures: None
+) -> None:
+    settings = load_config(assignments=["windows.size=8", "closures.enabled=false"])
+    results = run(tmp_path / "run", TrueBackbone(), config=settings)
+    assert results.report["closures"] is None
+    assert not (results.folder / "closures.json").exists()
+
+
+def test_a_run_without_candidates_counts_none(whole: Results) -> None:
+    closures = json.loads((whole.folder / "report.json").read_text())["closures"]
+    assert (closures["candidates"], closures["accepted"], closures["records"]) == (0, 0, [])
+    without, found = closures["trajectory_without"], whole.report["trajectory"]
+    assert without["ate_sim3_m"]["rmse"] == pytest.approx(found["ate_sim3_m"]["rmse"])
 
 
 def test_a_run_on_true_predictions_finds_the_true_path_and_depth(

@@ -23,7 +23,7 @@ Pairs = NDArray[np.int64]
 ACCEPTED = "#1a9850"
 REJECTED = "#c0392b"
 TRUTH = "#b4bcc4"
-_HEAD_PX = 150  # of a panel: title, labels and legend
+_HEAD_PX = 180  # of a panel: title, labels and legend
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def scales_picture(path: Path, curves: ScaleCurves) -> None:
             panels[0].plot(curves.distances, curves.truth, color=TRUTH, linewidth=5, label="truth")
             _draw_scales(panels[1], curves, 1 / curves.truth)
             panels[1].axhline(1, color=TRUTH, linewidth=3, zorder=1)
-            panels[1].set_title("The same over the truth's")
+            panels[1].set_title("Share of the true scale")
             panels[1].yaxis.set_major_formatter(PercentFormatter(1.0))
         _draw_scales(panels[0], curves, np.ones(len(curves.distances)))
         panels[-1].set_xlabel(f"distance travelled ({unit})")

@@ -19,9 +19,9 @@ from laser_slam.report.style import INK, MUTED, WIDTH_PX, picture
 from laser_slam.types import Image
 
 _GAP_PX = 14
-_CAPTION_PX = {1: 54, 2: 72}  # two lines, or three of half the width, by columns
+_CAPTION_PX = {1: 56, 2: 76}  # two lines, or three of half the width, by columns
 _HEAD_PX = 50
-_LINE = 132  # letters of a caption over the whole width
+_LINE = 120  # letters of a caption over the whole width
 _WIDE = 1.8  # images from this ratio of the sides on get a row for each pair
 
 
@@ -119,6 +119,7 @@ def similarity_picture(
                 edgecolors=color,
                 linewidths=1.4 if color == "#35d07f" else 0.9,
                 label=f"{label} ({len(pairs)})",
+                clip_on=False,
             )
         axes.set(xlim=(-0.5, num - 0.5), ylim=(-0.5, num - 0.5))
         legend = figure.legend(loc="outside lower center", ncols=2)
