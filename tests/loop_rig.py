@@ -95,7 +95,8 @@ class Rig:
         patch.setattr(laser_slam.slam.loops, "CandidateSearch", Search)
         patch.setattr(laser_slam.slam.loops, "judge", self.judge)
         self.config = config or Config()
-        (tmp_path / "windows").mkdir(parents=True)
+        for name in ("windows", "layers"):
+            (tmp_path / name).mkdir(parents=True)
         self.slam, self.files = Slam(self.config), Files(tmp_path)
         self.closer = LoopCloser(self.config, self.slam, self.files, Tools(lambda *_: None))  # type: ignore[arg-type, return-value]
 
@@ -119,7 +120,10 @@ class Rig:
         colors = marked(prediction.frames)
         self.files.save(len(self.slam.nodes), prediction, colors)
         self.files.alive.append(weakref.ref(prediction))
-        self.closer.add(self.slam.add(prediction, colors).prediction, colors)
+        submap = self.slam.add(prediction, colors)
+        if self.slam.layers is not None:
+            self.files.save_layers(submap.index, self.slam.layers)
+        self.closer.add(submap.prediction, colors)
 
     def judge(self, ends: CandidateEnds, _tools: Tools, _config: Config) -> Judged:
         a, b = ends.a, ends.b

@@ -1,6 +1,6 @@
 """A rendered drive around a block, seen by simulated networks: a run closes its loop."""
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -14,9 +14,10 @@ from laser_slam.backbones.base import Backbone
 from laser_slam.closures import ClosureRecord, read_closures
 from laser_slam.config import Config, SyntheticConfig, load_config
 from laser_slam.datasets.synthetic.drive import SyntheticDrive
+from laser_slam.fusion import fuse
 from laser_slam.pipeline import Pipeline
 from laser_slam.results import Results
-from laser_slam.types import Frame, Image, Prediction, SequenceInfo
+from laser_slam.types import Frame, Image, Prediction, SequenceInfo, Submap
 
 SETTINGS = [
     "backbone.name=simulated", "backbone.simulated.width=322", "windows.size=10",
@@ -94,6 +95,7 @@ class Run:
     results: Results
     records: list[ClosureRecord]
     network: Network
+    fused_at: dict[int, NDArray[np.float64]]
 
     @property
     def ate_m(self) -> float:
@@ -112,13 +114,25 @@ class World:
 
     def run(self, folder: Path, config: Config = CONFIG, interrupt_at: int | None = None) -> Run:
         network = Network(self.drive, self.answers, interrupt_at)
+        fused_at: dict[int, NDArray[np.float64]] = {}
+
+        def note(submaps: Iterable[Submap]) -> Iterator[Submap]:
+            for submap in submaps:
+                for i in np.flatnonzero(submap.is_owned):
+                    pose = submap.places[i].apply_poses(submap.prediction.window_from_cam[i])
+                    fused_at[int(submap.prediction.frames[i])] = pose
+                yield submap
+
         with pytest.MonkeyPatch.context() as patch:
             for name in dir(laser_slam.pipeline):
                 if name.startswith("draw_") or name == "stages_picture":
                     patch.setattr(laser_slam.pipeline, name, lambda *_: None)
+            patch.setattr(
+                laser_slam.pipeline, "fuse", lambda maps, settings: fuse(note(maps), settings)
+            )
             results = Pipeline(self.drive, config, folder, backbone=network).run()
         path = folder / "closures.json"
-        return Run(results, read_closures(path) if path.exists() else [], network)
+        return Run(results, read_closures(path) if path.exists() else [], network, fused_at)
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +154,14 @@ def without(world: World, tmp_path_factory: pytest.TempPathFactory) -> Run:
 def test_a_run_closes_its_loop_and_comes_nearer_to_the_truth(whole: Run, without: Run) -> None:
     assert any(record.is_accepted for record in whole.records)
     assert whole.ate_m < 0.7 * without.ate_m
+    assert max(record.window_b for record in whole.records) == whole.num_windows - 1
+
+
+def test_the_map_is_fused_where_the_trajectory_is(whole: Run) -> None:
+    trajectory = whole.results.trajectory
+    assert sorted(whole.fused_at) == trajectory.frames.tolist()
+    fused_at = [whole.fused_at[int(frame)] for frame in trajectory.frames]
+    assert np.allclose(fused_at, trajectory.world_from_cam, atol=1e-9)
 
 
 def test_every_closure_joins_frames_that_are_near_and_look_the_same_way(

@@ -13,6 +13,7 @@ from ring import (
     NO_DRIFT,
     NUM_FRAMES,
     NUM_WINDOWS,
+    SIZE,
     TIMES_S,
     Drift,
     ate_m,
@@ -31,6 +32,7 @@ from laser_slam.closures import CandidateEnds, Judged, Measurement, Tools
 from laser_slam.config import Config, load_config
 from laser_slam.errors import DegenerateGeometryError
 from laser_slam.sim3 import Sim3
+from laser_slam.slam import read_window
 from laser_slam.types import Prediction, WindowStatus
 
 
@@ -91,6 +93,35 @@ def test_the_scale_of_the_chain_is_that_of_the_older_over_the_newer_unit(rig: Ri
     expected = [units[r.window_b] / units[r.window_a] for r in rig.closer.records]
     assert len(expected) > 5
     assert np.allclose(rig.chain_scales, expected, rtol=0.02)
+
+
+def test_both_ends_are_measured_with_their_layers_aligned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each window has the floor, the lower half of its images, at a scale of its own."""
+    pairs: list[list[tuple[int, NDArray[np.float32]]]] = []
+
+    def note(ends: CandidateEnds) -> str:
+        pairs.append([(end.window, end.prediction.depth) for end in (ends.a, ends.b)])
+        return "not today"
+
+    def see(window: int) -> Prediction:
+        prediction = prediction_of(window, DRIFT)
+        prediction.depth[:, SIZE[0] // 2 :] *= np.float32(1 + 0.1 * (window % 3))
+        return prediction
+
+    config = load_config(assignments=["layers.enabled=always"])
+    rig = Rig(tmp_path, monkeypatch, note, config)
+    rig.drive(see=see)
+    rig.closer.finish()
+    assert len(pairs) > 5
+    for end in (0, 1):
+        moved = []
+        for window, depth in (pair[end] for pair in pairs):
+            stored = read_window(rig.files, window, config)
+            assert np.allclose(depth, stored.corrected.depth, rtol=2e-3)
+            moved.append(not np.allclose(depth, stored.raw.depth, rtol=0.02))
+        assert np.mean(moved) > 0.4
 
 
 def test_loops_are_closed_on_the_way_and_not_only_at_the_end(rig: Rig) -> None:
