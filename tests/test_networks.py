@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import golden
@@ -10,7 +11,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from laser_slam.errors import WeightsError
+from laser_slam.errors import DependencyError, WeightsError
 from laser_slam.networks.dinov2 import BASE, LARGE_WITH_REGISTERS, Encoder, EncoderConfig
 from laser_slam.networks.weights import Checkpoint, load_weights
 
@@ -222,6 +223,15 @@ def test_a_file_that_was_cut_off_is_refused(tmp_path: Path, name: str, share: fl
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
     assert "is not read" in refusal(unfilled(), path)
+
+
+def test_a_missing_reader_is_told_with_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = save(tiny_tensors(), tmp_path / "tiny.safetensors")
+    monkeypatch.setitem(sys.modules, "safetensors", None)
+    with pytest.raises(DependencyError, match=r"needs safetensors .* 'laser-slam\[networks\]'"):
+        load_weights(unfilled(), str(path), CHECKPOINT)
 
 
 class Harmful:

@@ -112,6 +112,12 @@ def test_the_full_network_says_what_the_original_says() -> None:
         found = differences("dinov2-salad", name, network)
         assert len(found) == 10
         assert max(found.values()) < golden.TOLERANCE, (name, found)
+    network.to(torch.bfloat16)
+    for name in "abcd":
+        case = golden.load_case("dinov2-salad", name)
+        with torch.no_grad():
+            cosines = (network(case.images).numpy() * case.expected["descriptor"]).sum(axis=1)
+        assert np.all((cosines > 0.9999) & (cosines < 1 - 1e-7)), (name, cosines)
 
 
 def test_transport_is_that_of_the_original() -> None:
@@ -185,6 +191,15 @@ def test_the_descriptor_is_the_network_on_the_squared_image(
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
     assert float(np.linalg.norm(found)) == pytest.approx(1, abs=1e-5)
     np.testing.assert_array_equal(descriptor.describe(image), found)
+
+
+def test_the_descriptor_may_compute_in_half_precision(
+    descriptor: SaladDescriptor, weights: Path
+) -> None:
+    config = PlacesConfig(salad_weights=str(weights), salad_size=126, salad_dtype="bfloat16")
+    image = street_views()[0]
+    cosine = float(SaladDescriptor(config).describe(image) @ descriptor.describe(image))
+    assert 0.9999 < cosine < 1 - 1e-7
 
 
 def test_another_look_at_a_view_is_found_among_others(descriptor: SaladDescriptor) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from laser_slam.config.section import Section
@@ -33,6 +35,9 @@ class PlacesConfig(Section):
     salad_weights: str = Field("", description="weights file of 'salad', dino_salad.ckpt")
     salad_size: int = Field(
         336, ge=126, multiple_of=14, description="side of the square that 'salad' looks at, px"
+    )
+    salad_dtype: Literal["float32", "bfloat16"] = Field(
+        "float32", description="numbers that 'salad' computes with; bfloat16: faster where AMX is"
     )
     width: int = Field(640, ge=160, description="wider images are reduced before description, px")
     num_features: int = Field(800, ge=50, description="features that a description sums up")

@@ -155,15 +155,16 @@ def _marginals(m: int, n: int, like: Tensor) -> _Marginals:
     return _Marginals(rows, patch)
 
 
-def load_salad(path: str) -> Salad:
-    """Build the network with the weights of a released or retrained checkpoint.
+def load_salad(path: str, dtype: torch.dtype = torch.float32) -> Salad:
+    """Build the network with the weights of a released or retrained checkpoint, as ``dtype``.
 
     Raises:
         WeightsError: the file is not there, cannot be read or is of another network.
     """
     with torch.device("meta"):  # takes no memory and no time
         network = Salad(SaladConfig())
-    load_weights(network, path, RELEASED, unused=("backbone.model.mask_token",))
+    unused = ("backbone.model.mask_token",)
+    load_weights(network, path, RELEASED, unused=unused, dtype=dtype)
     return network.requires_grad_(requires_grad=False).eval()
 
 

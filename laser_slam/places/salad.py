@@ -15,7 +15,7 @@ class SaladDescriptor:
     """Describe an image by a network that was trained to tell places, whatever light and season.
 
     Reference: Izquierdo and Civera, CVPR 2024 (arXiv:2311.15937).
-    Differs: float32 throughout; VGGT-Long and LASER take float16, which a CPU is slower at.
+    Differs: float32, or bfloat16 with the transport in float32; VGGT-Long and LASER take float16.
     """
 
     def __init__(self, config: PlacesConfig) -> None:
@@ -30,7 +30,8 @@ class SaladDescriptor:
 
         self._side = config.salad_size
         self._device = "cuda" if self._torch.cuda.is_available() else "cpu"
-        self._network = load_salad(config.salad_weights).to(self._device)
+        dtype = getattr(self._torch, config.salad_dtype)
+        self._network = load_salad(config.salad_weights, dtype).to(self._device)
 
     @property
     def size(self) -> int:
