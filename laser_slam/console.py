@@ -82,7 +82,7 @@ def summarize(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "windows", f"{windows['num']}{bridged}"
     if report["trajectory"]:
         yield from _summarize_trajectory(report["trajectory"])
-    if report["closures"]:
+    if report.get("closures"):  # a report of an older version has none
         yield "loops", _loops_in_words(report["closures"])
     if report["depth"]:
         scores = report["depth"]["by_trajectory_scale"] or report["depth"]["by_median_ratio"]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from laser_slam.errors import DatasetError, RunFolderError
 from laser_slam.evaluation.trajectory import evaluate_trajectory
-from laser_slam.results import draw_trajectory, write_report
+from laser_slam.results import CHAINED_FILE, draw_trajectory, write_report
 from laser_slam.types import Trajectory
 
 Array = NDArray[np.float64]
@@ -45,6 +45,9 @@ def rescore(folder: Path, truth_file: Path | None = None) -> dict[str, Any]:
         raise DatasetError(f"{truth_file or kept} cannot score {folder}: {errors.reason}")
     draw_trajectory(folder / "pictures", trajectory, truth, errors)
     report["trajectory"] = errors.numbers()
+    if report.get("closures"):
+        chained = read_trajectory(folder / CHAINED_FILE, None)
+        report["closures"]["trajectory_without"] = evaluate_trajectory(chained, truth).numbers()
     write_report(folder / "report.json", report)
     return report
 

@@ -62,7 +62,7 @@ def test_the_run_folder_holds_all_that_was_promised(whole: Results) -> None:
     assert names >= {f"pictures/{name}.png" for name in pictures}
     assert names >= {"pictures/similarity.png", "pictures/scales.png"}
     assert names >= {"config.yaml", "run.log", "report.json", "map.ply", "windows/000000.npz"}
-    assert names >= {"closures.json", "graph.g2o"}
+    assert names >= {"closures.json", "graph.g2o", "trajectory_without_loops_tum.txt"}
     assert not [name for name in names if "partial" in name]
     assert load_config(file=whole.folder / "config.yaml") == CONFIG
 
@@ -262,10 +262,22 @@ def test_logging_is_left_as_it_was(tmp_path: Path, no_pictures: None) -> None:
 
 def test_scoring_again_gives_the_same_scores(tmp_path: Path, no_pictures: None) -> None:
     results = run(tmp_path / "run", TrueBackbone())
-    again = rescore(tmp_path / "run")["trajectory"]
-    assert again["ate_sim3_m"]["rmse"] == pytest.approx(
-        results.report["trajectory"]["ate_sim3_m"]["rmse"], abs=1e-6
-    )
+    again = rescore(tmp_path / "run")
+    rmse = results.report["trajectory"]["ate_sim3_m"]["rmse"]
+    for errors in (again["trajectory"], again["closures"]["trajectory_without"]):
+        assert errors["ate_sim3_m"]["rmse"] == pytest.approx(rmse, abs=1e-6)
+
+
+def test_another_truth_scores_the_path_without_loops_as_well(
+    tmp_path: Path, no_pictures: None
+) -> None:
+    run(tmp_path / "run", TrueBackbone())
+    table = np.loadtxt(tmp_path / "run" / "truth_tum.txt")
+    table[:, 1:4] *= 3
+    np.savetxt(tmp_path / "larger.txt", table)
+    report = rescore(tmp_path / "run", tmp_path / "larger.txt")
+    for errors in (report["trajectory"], report["closures"]["trajectory_without"]):
+        assert errors["path_length_m"] == pytest.approx(3 * 14, rel=0.05)
 
 
 def test_scoring_against_a_truth_of_another_length_is_refused(

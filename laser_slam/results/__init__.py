@@ -1,7 +1,7 @@
 """What a run leaves: scores against the truth, files, pictures, the report."""
 
 from laser_slam.results.findings import Findings, draw_findings, write_findings
-from laser_slam.results.loops import Loops, describe_loops, look_back
+from laser_slam.results.loops import CHAINED_FILE, Loops, describe_loops, look_back
 from laser_slam.results.pictures import draw_trajectory
 from laser_slam.results.report import (
     Results,
@@ -18,6 +18,7 @@ from laser_slam.results.scores import (
 )
 
 __all__ = [
+    "CHAINED_FILE",
     "Findings",
     "KeyframeView",
     "Loops",

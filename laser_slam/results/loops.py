@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from laser_slam.closures import ClosureRecord, write_closures
 from laser_slam.errors import DegenerateGeometryError
 from laser_slam.evaluation.trajectory import TrajectoryErrors, evaluate_trajectory
+from laser_slam.export import write_tum
 from laser_slam.places.similarity import SimilarityMap
 from laser_slam.pose_graph import write_g2o
 from laser_slam.slam import LoopCloser, Slam
@@ -23,6 +24,7 @@ from laser_slam.types import Trajectory
 
 Array = NDArray[np.float64]
 
+CHAINED_FILE = "trajectory_without_loops_tum.txt"
 NUM_SIGMAS = 20  # windows of which the report says how sure they are
 
 logger = logging.getLogger(__name__)
@@ -87,13 +89,14 @@ def _sigmas(slam: Slam) -> dict[int, Array]:
 
 
 def write_loops(folder: Path, loops: Loops, slam: Slam) -> None:
-    """Write what became of each candidate, and the pose graph in g2o's format.
+    """Write the records of all candidates, the pose graph (g2o), and the path without loops (TUM).
 
     Raises:
         RunFolderError: a file cannot be written.
     """
     write_closures(folder / "closures.json", loops.records)
     write_g2o(folder / "graph.g2o", slam.pose_graph())
+    write_tum(folder / CHAINED_FILE, loops.chained)
 
 
 def describe_loops(loops: Loops | None) -> dict[str, Any] | None:
