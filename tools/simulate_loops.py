@@ -39,9 +39,9 @@ from laser_slam.datasets.synthetic.drive import SyntheticDrive
 from laser_slam.errors import LaserSlamError
 from laser_slam.sim3 import Array
 
-# Errors of the backbone, the same for all sequences, such that chaining without closures drifts about
-# as ORB-SLAM2 without loop closure in the LASER paper's KITTI table. Means without 01: 26.5 m there,
-# 36 m here with seed 0; errors of one sequence differ between seeds by a factor of 2 and more.
+# Errors of the backbone, the same for all sequences. Chaining without closures then drifts about as
+# ORB-SLAM2 without loop closure in the LASER paper's KITTI table: means without 01 are 26.5 m
+# there, 36 m here with seed 0; one sequence differs between seeds by a factor of 2 and more.
 SETTINGS = (
     "backbone.simulated.scale_sigma=0.2",
     "backbone.simulated.smooth_sigma=0.03",
