@@ -179,6 +179,9 @@ def test_a_graph_without_covariance_is_warned_of_and_the_run_goes_on(
         loops = loops_of(chain(DRIFT, 3), [])
     assert loops.sigmas == {}
     assert "no covariance" in caplog.text
+    report = describe_loops(loops)
+    assert report is not None
+    assert report["sigmas"] is None
 
 
 def test_no_truth_no_closure_and_no_search_are_told_apart(closed: Slam) -> None:

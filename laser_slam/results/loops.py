@@ -110,15 +110,17 @@ def describe_loops(loops: Loops | None) -> dict[str, Any] | None:
         "distrusted": loops.num_distrusted,
         "refused": dict(Counter(refused).most_common()),
         "trajectory_without": loops.errors.numbers() if loops.errors else None,
-        "sigmas": {
-            str(index): {
-                "rotation_deg": np.degrees(sigmas[:3]),
-                "translation": sigmas[3:6],
-                "scale_percent": 100 * float(sigmas[6]),
-            }
-            for index, sigmas in loops.sigmas.items()
-        },
+        "sigmas": {str(i): _in_words(sigmas) for i, sigmas in loops.sigmas.items()} or None,
         "records": [asdict(record) for record in loops.records],
+    }
+
+
+def _in_words(sigmas: Array) -> dict[str, Any]:
+    """Name the (7,) sigmas of a place in the world's axes and units."""
+    return {
+        "rotation_deg": np.degrees(sigmas[:3]),
+        "translation": sigmas[3:6],
+        "scale_percent": 100 * float(sigmas[6]),
     }
 
 
