@@ -25,7 +25,7 @@ SETTINGS = [
     "run.samples=1",
 ]  # fmt: skip
 CONFIG = load_config(assignments=SETTINGS)
-NEAR_M, SAME_WAY_DEG = 3.0, 30.0
+NEAR_M, SAME_WAY_DEG = 8.0, 30.0  # one view of the street; it is 130 m around the block
 
 
 class Drive:
