@@ -2,10 +2,11 @@ VENV ?= .venv
 
 .PHONY: setup demo test lint check clean
 
-setup:  ## virtual environment in $(VENV), system libraries for Open3D
-	tools/setup.sh $(VENV)
+setup:  ## virtual environment in $(VENV) with all that developers need
+	tools/setup.sh $(VENV) dev
 
-demo: setup  ## a generated drive through the whole system
+demo:  ## a generated drive through the whole system
+	tools/setup.sh $(VENV)
 	$(VENV)/bin/laser-slam demo
 
 test: setup  ## the tests

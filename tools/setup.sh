@@ -1,12 +1,14 @@
 #!/usr/bin/env bash
 # Set up laser-slam: a virtual environment with the pinned packages, and Open3D's system libraries.
 #
-#   tools/setup.sh [FOLDER]     FOLDER: of the virtual environment, .venv by default
+#   tools/setup.sh [FOLDER [EXTRAS]]     FOLDER: of the virtual environment, .venv by default
+#                                        EXTRAS: such as dev, what the tests need
 #
 # A Python of one's own choice: PYTHON=/path/to/python3.12 tools/setup.sh
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 venv=${1:-.venv}
+extras=${2:-}
 system_packages=(libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1)
 
 is_supported() { "$1" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' 2>/dev/null; }
@@ -65,12 +67,14 @@ ensure_open3d() {
 }
 
 # A stamp newer than what it was made from means that nothing is to be done.
-stamp=$venv/.laser-slam-is-set-up
-if [ "$stamp" -nt pyproject.toml ] && [ "$stamp" -nt constraints.txt ]; then
-    exit 0
-fi
+stamp=$venv/.laser-slam-is-set-up${extras:+-with-$extras}
+for mark in "$stamp" "$venv/.laser-slam-is-set-up-with-dev"; do
+    if [ "$mark" -nt pyproject.toml ] && [ "$mark" -nt constraints.txt ]; then
+        exit 0
+    fi
+done
 is_supported "$venv/bin/python" || make_venv
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".${extras:+[$extras]}"
 ensure_open3d
 touch "$stamp"
 echo "setup: done; 'source $venv/bin/activate' makes laser-slam a command"

@@ -18,6 +18,7 @@ from laser_slam.layers.tracks import Pieces, join_frames, link_tracks
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+_MAX_CELLS = 150_000  # of all shared frames; more only cost time
 _BIN = 0.2  # of log depth: what a curve may treat differently
 _SAMPLES = 10_000  # depths that tell where the bins begin
 
@@ -74,6 +75,8 @@ def _measure(
 ) -> tuple[Pieces, Indices]:
     """Measure each edge, apart for each range of depth; return what can be trusted and its edge."""
     used = np.flatnonzero((edge_of_cell >= 0) & (shared.weight > 0))
+    thinned = 1 + len(used) // _MAX_CELLS
+    used = used[::thinned]
     edge = edge_of_cell.reshape(-1)[used]
     source, target, weight = (
         maps.reshape(-1)[used] for maps in (shared.source, shared.target, shared.weight)
@@ -83,7 +86,7 @@ def _measure(
     occupied, group = _numbered(edge * num_bins + depth_bin)
     ratios = measure_ratios(Pairs(group, source, target, weight, len(occupied)), config.scale)
     _, height, width = edge_of_cell.shape
-    trusted = _is_trusted(ratios, height * width, config)
+    trusted = _is_trusted(ratios, height * width // thinned, config)
     place = used % (height * width)
     sums = sum_by_group(group, place, width, log_depth, len(occupied))
     depth, column, row = sums / ratios.support
