@@ -299,7 +299,8 @@ def test_a_window_of_both_ends_measures_the_closure_within_its_sigmas(scene: Sce
         true = scene.a_from_b(a, b)
         misfits.append(float(np.mean((error_between(found.a_from_b, true) / found.sigmas) ** 2)))
         cameras.append(camera_error(found.a_from_b, true, a))
-    assert 0.1 < np.mean(misfits) < 4
+    # On the safe side: these windows see the same surfaces, and hardly bend.
+    assert 0.03 < np.mean(misfits) < 1
     assert (np.median(cameras, axis=0) < (0.02, 0.5, 0.05)).all()
 
 

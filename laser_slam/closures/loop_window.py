@@ -21,6 +21,11 @@ from laser_slam.sim3 import Array, Sim3
 from laser_slam.types import Image, Prediction, Registration, WindowStatus
 
 
+# A window bends by more than the frames that it shares with another can show: from the middle of
+# one to the middle of the next, errors are two to three times the sigmas of their registration.
+_BEND = 3.0
+
+
 def measure_by_window(
     a: End, b: End, backbone: Backbone, intrinsics: Array | None, config: Config
 ) -> Measurement:
@@ -42,7 +47,7 @@ def measure_by_window(
     a_from_b = a_from_loop @ b_from_loop.inverse()
     num = sum(side.num_pixels for side in sides)
     residual = max(side.residual for side in sides)
-    covariance = _composed(a_from_b, a_from_loop, sides)
+    covariance = _BEND**2 * _composed(a_from_b, a_from_loop, sides)
     return Measurement(a_from_b, covariance, num, num, residual, "loop window")
 
 
