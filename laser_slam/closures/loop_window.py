@@ -20,7 +20,6 @@ from laser_slam.registration import register
 from laser_slam.sim3 import Array, Sim3
 from laser_slam.types import Image, Prediction, Registration, WindowStatus
 
-
 # A window bends by more than the frames that it shares with another can show: from the middle of
 # one to the middle of the next, errors are two to three times the sigmas of their registration.
 _BEND = 3.0
