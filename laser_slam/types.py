@@ -132,6 +132,8 @@ class Prediction:
         intrinsics: (N, 3, 3) in pixels of the depth map.
         status: what holds; anything but OK has no depth at all.
         warnings: what a person should know of this window, one sentence each.
+        tokens: (N, D) what the backbone's own encoder makes of each image, pooled over it: it can
+            tell places apart; None: it has no encoder.
 
     Raises:
         ValueError: shapes disagree, frames do not rise, poses are not finite, confidence leaves
@@ -145,6 +147,7 @@ class Prediction:
     intrinsics: NDArray[np.float64]
     status: WindowStatus = WindowStatus.OK
     warnings: tuple[str, ...] = ()
+    tokens: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and finiteness once, here."""
@@ -159,11 +162,19 @@ class Prediction:
             raise ValueError("poses and intrinsics must be finite")
         if not (np.diff(self.frames) > 0).all():
             raise ValueError("frame indices must be rising")
+        _check_tokens(self.tokens, num)
         if not ((self.confidence >= 0) & (self.confidence <= 1)).all():
             raise ValueError("confidence must be in [0, 1]")
         seen = self.depth[self.confidence > 0]
         if not ((seen > 0) & (seen < np.inf)).all():
             raise ValueError("depth must be positive and finite where confidence is above 0")
+
+
+def _check_tokens(tokens: NDArray[np.float32] | None, num: int) -> None:
+    if tokens is None:
+        return
+    if tokens.ndim != 2 or len(tokens) != num or not np.isfinite(tokens).all():
+        raise ValueError(f"tokens must be ({num}, D) and finite, got {tokens.shape}")
 
 
 @dataclass(frozen=True)

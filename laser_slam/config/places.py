@@ -31,7 +31,9 @@ class VerificationConfig(Section):
 class PlacesConfig(Section):
     """Keyframes that may show a place seen before, and their check."""
 
-    descriptor: str = Field("vlad", description="one of the names in laser_slam.places.DESCRIPTORS")
+    descriptor: str = Field(
+        "vlad", description="one of laser_slam.places.DESCRIPTORS, or backbone: its own tokens"
+    )
     salad_weights: str = Field("", description="weights file of 'salad', dino_salad.ckpt")
     salad_size: int = Field(
         336, ge=126, multiple_of=14, description="side of the square that 'salad' looks at, px"

@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from laser_slam.errors import ConfigError
+from laser_slam.places.backbone import BACKBONE, describe_by_tokens
 from laser_slam.places.candidates import Candidate, CandidateSearch, Place
 from laser_slam.places.index import PlaceIndex
 from laser_slam.places.verification import Features, Verification, find_features, verify
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from laser_slam.places.base import Descriptor
 
 __all__ = [
+    "BACKBONE",
     "DESCRIPTORS",
     "Candidate",
     "CandidateSearch",
@@ -22,6 +24,7 @@ __all__ = [
     "Place",
     "PlaceIndex",
     "Verification",
+    "describe_by_tokens",
     "find_features",
     "make_descriptor",
     "verify",
@@ -42,7 +45,8 @@ def make_descriptor(config: PlacesConfig) -> Descriptor:
     """
     if config.descriptor not in DESCRIPTORS:
         raise ConfigError(
-            f"places.descriptor: no '{config.descriptor}'; there is {', '.join(DESCRIPTORS)}"
+            f"places.descriptor: no '{config.descriptor}'; "
+            f"there is {', '.join([*DESCRIPTORS, BACKBONE])}"
         )
     module, _, attribute = DESCRIPTORS[config.descriptor].partition(":")
     descriptor: Descriptor = getattr(import_module(module), attribute)(config)

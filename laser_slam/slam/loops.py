@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 from laser_slam.closures import CandidateEnds, ClosureRecord, End, Tools, judge
 from laser_slam.config import Config
 from laser_slam.errors import DegenerateGeometryError
-from laser_slam.places import Candidate, CandidateSearch, Place, make_descriptor
+from laser_slam.places import (
+    BACKBONE,
+    Candidate,
+    CandidateSearch,
+    Place,
+    describe_by_tokens,
+    make_descriptor,
+)
+from laser_slam.places.base import Descriptor
 from laser_slam.places.similarity import SimilarityMap
 from laser_slam.slam.chain import Slam
 from laser_slam.slam.node import Node
@@ -45,8 +53,10 @@ class LoopCloser:
         self._slam = slam
         self._files = files
         self._tools = tools
-        self._descriptor = make_descriptor(config.places)
-        self._search = CandidateSearch(config.places, self._descriptor.size)
+        self._descriptor: Descriptor | None = None
+        if config.places.descriptor != BACKBONE:
+            self._descriptor = make_descriptor(config.places)
+        self._search: CandidateSearch | None = None  # until the length of descriptors is known
         self._waiting: tuple[Prediction, Image] | None = None
         self._travelled = 0.0
         self._unit = 1.0  # median depth of the last window that had one
@@ -76,7 +86,7 @@ class LoopCloser:
 
     def similarity_map(self) -> SimilarityMap:
         """Return how much all keyframes so far resemble each other."""
-        return self._search.similarity_map()
+        return (self._search or CandidateSearch(self._config.places, 1)).similarity_map()
 
     def add(self, prediction: Prediction, colors: Image) -> None:
         """Look at the window before the one that was added last.
@@ -100,9 +110,18 @@ class LoopCloser:
         if prediction.status is not WindowStatus.OK or not places:
             return
         rows = np.searchsorted(node.frames, [place.frame for place in places])
-        descriptors = np.stack([self._descriptor.describe(colors[row]) for row in rows])
+        descriptors = self._describe(prediction, colors, rows)
+        if self._search is None:
+            self._search = CandidateSearch(self._config.places, descriptors.shape[1])
         for candidate in self._search.add(places, descriptors):
             self._examine(candidate, prediction, colors)
+
+    def _describe(
+        self, prediction: Prediction, colors: Image, rows: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        if self._descriptor is None:
+            return describe_by_tokens(prediction, rows)
+        return np.stack([self._descriptor.describe(colors[row]) for row in rows])
 
     def _places(self, node: Node, prediction: Prediction) -> Iterator[Place]:
         """Give the frames that a window owns, with the way to them in median depths.

@@ -181,7 +181,9 @@ def _pack(prediction: Prediction) -> dict[str, NDArray[Any]]:
         lost = ~(np.isfinite(depth) & (np.abs(depth) >= np.finfo(np.float16).tiny))
     depth[lost] = np.nan
     confidence = np.where(lost, 0, np.rint(prediction.confidence * 255)).astype(np.uint8)
+    tokens = {} if prediction.tokens is None else {"tokens": prediction.tokens.astype(np.float32)}
     return {
+        **tokens,
         "version": np.array(FORMAT_VERSION),
         "frames": prediction.frames,
         "depth": depth,
@@ -203,6 +205,7 @@ def _unpack(arrays: dict[str, NDArray[Any]]) -> Prediction:
         intrinsics=arrays["intrinsics"],
         status=WindowStatus(str(arrays["status"])),
         warnings=tuple(str(warning) for warning in arrays["warnings"]),
+        tokens=arrays.get("tokens"),
     )
 
 
