@@ -18,6 +18,7 @@ _BITS = 21  # of a voxel's index per axis: three fit into one int64
 _HALF = 1 << (_BITS - 1)
 _MASK = (1 << _BITS) - 1
 _FIRST_VOXELS = 1 << 16
+_PORTION = 1 << 20  # voxels that are turned into points at once
 _MAX_LOAD = 0.6  # of the table of slots: beyond it, open addressing gets slow
 
 
@@ -99,15 +100,16 @@ class VoxelGrid:
                 _HALF,
             )
         kept = np.flatnonzero(_supported(self.voxels, self.num_voxels, min_observations))
-        keys, sums = self.voxels.keys[kept], self.voxels.sums[kept]
-        weights = sums[:, :1]
-        corners = np.stack([(keys >> shift & _MASK) - _HALF for shift in (2 * _BITS, _BITS, 0)], 1)
-        return Cloud(
-            points=(corners + sums[:, 1:4] / weights) * self.voxel_size,
-            colors=np.rint(sums[:, 4:] / weights).clip(0, 255).astype(np.uint8),
-            weights=sums[:, 0].copy(),
-            voxel_size=self.voxel_size,
-        )
+        points, colors = np.empty((len(kept), 3)), np.empty((len(kept), 3), np.uint8)
+        for start in range(0, len(kept), _PORTION):  # the map is large enough without copies of it
+            part = slice(start, start + _PORTION)
+            keys, sums = self.voxels.keys[kept[part]], self.voxels.sums[kept[part]]
+            means = sums[:, 1:] / sums[:, :1]
+            for axis, shift in enumerate((2 * _BITS, _BITS, 0)):
+                corner = (keys >> shift & _MASK) - _HALF
+                points[part, axis] = (corner + means[:, axis]) * self.voxel_size
+            colors[part] = np.rint(means[:, 3:]).clip(0, 255)
+        return Cloud(points, colors, self.voxels.sums[kept, 0], self.voxel_size)
 
 
 def _allocate(num_voxels: int) -> _Voxels:
