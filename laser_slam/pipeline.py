@@ -115,7 +115,7 @@ class Pipeline:
         self._is_complete = False
         self.folder = Path(os.path.normpath(out)) if out else new_run_folder(self._info.name)
         self._files = WindowFiles(self.folder)
-        self._closer: LoopCloser | None = None
+        self._closer = self._make_closer()
 
     def run(self) -> Results:
         """Map the sequence.
@@ -127,7 +127,6 @@ class Pipeline:
         with run_log(self.folder / "run.log") as warnings:
             with self._clock.stage("calibrate"):
                 self._calibrate()
-            self._closer = self._make_closer()
             for window in self._windows():
                 prediction, colors = self._predict(window)
                 self._place(prediction, colors)
@@ -171,8 +170,7 @@ class Pipeline:
     def _make_closer(self) -> LoopCloser | None:
         if not self._config.closures.enabled:
             return None
-        matcher = make_matcher(self._config.places.verification)
-        tools = Tools(matcher, self.backbone, self._rectifier.intrinsics)
+        tools = Tools(make_matcher(self._config.places.verification), self.backbone)
         return LoopCloser(self._config, self._slam, self._files, tools)
 
     def _first_windows(self) -> Iterator[Window]:

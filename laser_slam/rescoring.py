@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 def rescore(folder: Path, truth_file: Path | None = None) -> dict[str, Any]:
-    """Compare a run's trajectory with the truth; write the scores and pictures anew.
+    """Compare a run's trajectory with the truth; write scores, trajectory.png and drift.png anew.
 
     Args:
         folder: of a finished run.

@@ -33,7 +33,7 @@ from laser_slam.errors import LaserSlamError
 from laser_slam.evaluation.depth import evaluate_depth
 from laser_slam.evaluation.trajectory import evaluate_trajectory
 from laser_slam.layers import apply_layers, smooth_layers
-from laser_slam.rectification import Rectifier
+from laser_slam.rectification import Rectifier, reduce_images
 from laser_slam.slam import Slam
 from laser_slam.store import WindowFiles
 from laser_slam.types import NO_DISTORTION, Calibration, Layers, Prediction, Window
@@ -120,7 +120,7 @@ class Predictions:
         for window in windows(self.rectifier, num_frames):
             prediction = backbone.predict(window.images, window.frames, self.rectifier.intrinsics)
             height, width = prediction.depth.shape[1:]
-            colors = np.stack([cv2.resize(image, (width, height)) for image in window.images])
+            colors = reduce_images(window.images, (height, width))
             self.files.save(self.num, prediction, colors)
             self.num += 1
 
@@ -136,6 +136,9 @@ def main(  # noqa: PLR0913, PLR0917  (one for each flag)
     min_confidence: Annotated[float, typer.Option(help="of the pixels that count")] = 0.0,
 ) -> None:
     """Print the table."""
+    unknown = [name for name in rows.split(",") if name.strip() not in ROWS]
+    if unknown:
+        raise typer.BadParameter(f"no row {', '.join(unknown)}; there is {', '.join(ROWS)}")
     try:
         dataset = _open(data, folder, sequence, assignments or [])
         table = Table("", "AbsRel", "δ<1.25", "mismatch", "ATE m", "layers reached")

@@ -32,12 +32,14 @@ class CandidateEnds:
         b: the other.
         similarity: of the two frames' descriptors.
         chain_scale: units of a per unit of b, as the chain of registrations has it.
+        guess_sigma: of its logarithm, from windows whose place was only guessed.
     """
 
     a: End
     b: End
     similarity: float
     chain_scale: float
+    guess_sigma: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -47,12 +49,10 @@ class Tools:
     Attributes:
         matcher: of two images; see ``make_matcher``.
         backbone: for windows of both ends, if it ``sees_far_frames``; None: matches must do.
-        intrinsics: (3, 3) in pixels of the depth maps, given to the backbone; None: unknown.
     """
 
     matcher: Matcher
     backbone: Backbone | None = None
-    intrinsics: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def _measure(
     _note(found, numbers)
     if tools.backbone is None or not tools.backbone.sees_far_frames:
         return found
-    other = measure_by_window(a, b, tools.backbone, tools.intrinsics, config)
+    other = measure_by_window(a, b, tools.backbone, a.prediction.intrinsics[a.matched], config)
     sigmas = disagreement(found, other)
     numbers["disagreement"] = sigmas
     if sigmas > config.closures.max_disagreement:
@@ -137,7 +137,8 @@ def _check_similarity(
         )
     scale = measurement.a_from_b.scale
     apart = abs(candidate.a.window - candidate.b.window)
-    band = config.max_scale_ratio * float(np.exp(_SURE * config.scale_drift * np.sqrt(apart)))
+    sigma = float(np.hypot(config.scale_drift * np.sqrt(apart), candidate.guess_sigma))
+    band = config.max_scale_ratio * float(np.exp(_SURE * sigma))
     if abs(np.log(scale / candidate.chain_scale)) > np.log(band):
         raise DegenerateGeometryError(
             f"scale {scale:.3g}, where the chain says {candidate.chain_scale:.3g} "

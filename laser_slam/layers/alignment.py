@@ -30,7 +30,7 @@ class LayerCounts:
         curve_sigma: strength of the distortion that depends on depth: a log's standard deviation.
         layer_sigma: strength of the layers' own.
         mismatch_before: median absolute log-ratio of the shared depth; None: nothing shared.
-        mismatch_after: the same, after the correction.
+        mismatch_after: the same, after the correction; a second pass comes on top.
     """
 
     layers: int

@@ -177,9 +177,11 @@ class PoseGraph:
         problem = Problem(self._chain, self._closures, self._config)
         start = self._values
         found = solve(problem, start, self._left_out)
+        # First what may raise: a fit without places leaves the graph as it was.
+        places = {index: from_gtsam(found.values.atSimilarity3(index)) for index in self._rows}
         self._values, self._left_out = found.values, ~found.is_trusted
         return Optimised(
-            world_from_window=self.places,
+            world_from_window=places,
             is_trusted=found.is_trusted,
             misfits=np.sqrt(found.misfits),
             cost_before=problem.cost(start, found.is_trusted),

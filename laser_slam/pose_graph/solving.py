@@ -183,12 +183,16 @@ def _surprises(problem: Problem, current: Fit) -> Array:
     graph = problem.graph(problem.weighted(current.is_trusted))
     try:
         marginals = gtsam.Marginals(graph, current.values)
+        doubted = np.flatnonzero(~current.is_trusted).tolist()
+        keys_of = {row: problem.closures[row].keys() for row in doubted}
+        joints = {
+            row: marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
+            for row, keys in keys_of.items()
+        }
     except RuntimeError:  # what GTSAM raises for a singular system
         return out
-    for row in np.flatnonzero(~current.is_trusted).tolist():
-        factor = problem.closures[row]
-        keys = factor.keys()
-        joint = marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
+    for row, joint in joints.items():
+        factor, keys = problem.closures[row], keys_of[row]
         covariance = np.block([[joint.at(a, b) for b in keys] for a in keys])
         jacobian, residual = factor.linearize(current.values).jacobian()
         spread = problem.doubt**2 * jacobian @ covariance @ jacobian.T

@@ -60,7 +60,7 @@ def mismatch_picture(
         axes = figure.add_subplot()
         axes.plot(windows, before, color=ACCENT, marker="o", ms=3, label="after registration")
         axes.plot(windows, after, color=SECOND, marker="o", ms=3, label="with layer scales")
-        axes.set_title("Depth of shared frames: difference to the window before (median)")
+        axes.set_title("Depth of shared frames: difference to the window before (first pass)")
         axes.set_xlabel("window")
         axes.set_ylim(bottom=0)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -22,7 +22,16 @@ from laser_slam.types import Calibration, Cloud, SequenceInfo, Trajectory
 
 Array = NDArray[np.float64]
 
-PACKAGES = ("numpy", "numba", "opencv-python-headless", "open3d", "poselib", "scipy")
+PACKAGES = (
+    "numpy",
+    "numba",
+    "opencv-python-headless",
+    "open3d",
+    "poselib",
+    "scipy",
+    "gtsam",
+    "torch",
+)
 
 
 @dataclass(frozen=True)

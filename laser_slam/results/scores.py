@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from laser_slam.evaluation.depth import evaluate_depth
 from laser_slam.evaluation.trajectory import TrajectoryErrors, evaluate_trajectory
+from laser_slam.pose_graph import spread_corrections
 from laser_slam.slam import Node, StoredWindow
 from laser_slam.types import Image, Trajectory
 
@@ -66,14 +67,19 @@ def sample_views(nodes: Sequence[Node], load: Load, num: int) -> Iterator[Keyfra
         load: reads a window back by its index.
         num: how many.
     """
-    owned = [(node, i) for node in nodes for i in np.flatnonzero(node.is_owned)]
+    placed = zip(nodes, spread_corrections([node.moved for node in nodes]), strict=True)
+    owned = [
+        (node, int(i), place)
+        for node, places in placed
+        for i, place in zip(np.flatnonzero(node.is_owned), places, strict=True)
+    ]
     chosen = np.unique(np.linspace(0, len(owned) - 1, min(num, len(owned))).round().astype(int))
     index = -1
-    for node, i in (owned[k] for k in chosen):
+    for node, i, place in (owned[k] for k in chosen):
         if node.index != index:
             index = node.index
             window = load(index)
-        scale = np.float32(node.world_from_window.scale)
+        scale = np.float32(place.scale)
         depth = window.corrected.depth[i] * scale
         if np.isfinite(depth).any():
             yield KeyframeView(

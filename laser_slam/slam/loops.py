@@ -148,7 +148,10 @@ class LoopCloser:
             nodes[newer.window].world_from_window.scale
             / nodes[older.window].world_from_window.scale
         )
-        ends = CandidateEnds(a, b, candidate.similarity, chain_scale)
+        between = [node.registration for node in nodes[older.window + 1 : newer.window + 1]]
+        guesses = [link.sigmas[6] for link in between if link is not None and link.bridged]
+        guess_sigma = float(np.linalg.norm(guesses))
+        ends = CandidateEnds(a, b, candidate.similarity, chain_scale, guess_sigma)
         judged = judge(ends, self._tools, self._config)
         record, found = judged.record, judged.measurement
         if found is not None:

@@ -29,6 +29,7 @@ from laser_slam.types import (
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
+FAR_FRAMES = 50  # between neighbours of one window: it was put together from two places
 PATCH_PX = 14  # networks want whole patches
 SIMULATED = (
     "simulated: depth and poses are the data set's own truth with errors added, "
@@ -124,7 +125,9 @@ class SimulatedBackbone:
     ) -> Array:
         """Fill (N, H, W) depth and confidence ``out``; return (N, 4, 4) window_from_cam."""
         config = self._config
-        draws = Draws(config.seed, int(frames[0]), config.persistence)
+        is_torn = len(frames) > 1 and int(np.diff(frames).max()) > FAR_FRAMES
+        last = int(frames[-1]) if is_torn else 0
+        draws = Draws(config.seed, int(frames[0]), config.persistence, last)
         unit = float(np.exp(config.scale_sigma * draws.own(Purpose.SCALE).standard_normal()))
         distortion = Distortion(config, draws)
         ground = None

@@ -28,12 +28,15 @@ class Draws:
     Attributes:
         seed: of the run.
         first_frame: of the window; it tells windows apart.
+        last_frame: the same, of a window whose frames jump; 0: they follow one another. A window
+            of two far places is another one than that which begins at the same frame.
         persistence: share of the variance that all windows have in common.
     """
 
     seed: int
     first_frame: int
     persistence: float
+    last_frame: int = 0
 
     @property
     def common_weight(self) -> float:
@@ -45,13 +48,17 @@ class Draws:
         """Return the factor of what is the window's own; both squares add up to 1."""
         return float(np.sqrt(1 - self.persistence))
 
+    @property
+    def _window(self) -> list[int]:
+        return [self.seed, self.last_frame] if self.last_frame else [self.seed]
+
     def common(self, purpose: Purpose, frame: int = -1) -> np.random.Generator:
         """Return the generator that every window of the run has."""
         return np.random.default_rng([self.seed, purpose, 0, frame + 1])
 
     def own(self, purpose: Purpose, frame: int = -1) -> np.random.Generator:
         """Return the generator of this window."""
-        return np.random.default_rng([self.seed, purpose, self.first_frame + 1, frame + 1])
+        return np.random.default_rng([*self._window, purpose, self.first_frame + 1, frame + 1])
 
     def normals(
         self, purpose: Purpose, shape: tuple[int, ...], frame: int = -1
