@@ -96,3 +96,13 @@ def distort(slopes: Array, distortion: Array) -> Array:
     bent_x = radial * x + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     bent_y = radial * y + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
     return np.stack([bent_x, bent_y], axis=-1)
+
+
+def poselib_camera(intrinsics: Array) -> dict[str, object]:
+    """Describe a pinhole camera as poselib wants it.
+
+    It applies the parameters as they are, so pixel centres stay where ours are: at integers. Width
+    and height must be there, and nothing reads them.
+    """
+    params = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
+    return {"model": "PINHOLE", "width": 0, "height": 0, "params": params}

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Mapping, Sequence
 from functools import cache
+from importlib import import_module
 from typing import Any
 
-from laser_slam.errors import DependencyError
+from laser_slam.errors import ConfigError, DependencyError
 
 
 @cache
@@ -76,3 +78,23 @@ def _preload_libusb() -> None:
     path = libusb_package.get_library_path()
     if path is not None:
         ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+
+
+def import_named(
+    table: Mapping[str, str], name: str, setting: str, others: Sequence[str] = ()
+) -> Any:
+    """Import what a setting names.
+
+    Args:
+        table: name to ``module:attribute``.
+        name: that was chosen.
+        setting: as ``section.key``, for the error.
+        others: names that the setting may have beside those of the table.
+
+    Raises:
+        ConfigError: the table has no such name.
+    """
+    if name not in table:
+        raise ConfigError(f"{setting}: no '{name}'; there is {', '.join([*table, *others])}")
+    module, _, attribute = table[name].partition(":")
+    return getattr(import_module(module), attribute)

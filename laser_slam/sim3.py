@@ -268,3 +268,12 @@ def _velocity(frames: NDArray[np.int64], poses: Array) -> tuple[Array, Array]:
     return (rotation_log(steps[:, :3, :3]) / gaps).mean(axis=0), (steps[:, :3, 3] / gaps).mean(
         axis=0
     )
+
+
+def cross_matrix(vectors: Array) -> Array:
+    """Return the (..., 3, 3) matrices of the cross product with (..., 3) vectors."""
+    out = np.zeros((*vectors.shape, 3))
+    for row, col, axis, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 2, 0, -1)):
+        out[..., row, col] = sign * vectors[..., axis]
+        out[..., col, row] = -out[..., row, col]
+    return out

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
 from typing import TYPE_CHECKING
 
-from laser_slam.errors import ConfigError
+from laser_slam.dependencies import import_named
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,9 +37,7 @@ def make_backbone(
     Raises:
         ConfigError: no backbone has this name, or it simulates and the data set has no truth.
     """
-    if config.name not in BACKBONES:
-        raise ConfigError(f"backbone.name: no '{config.name}'; there is {', '.join(BACKBONES)}")
-    module, _, attribute = BACKBONES[config.name].partition(":")
+    chosen = import_named(BACKBONES, config.name, "backbone.name")
     truth = (info, true_depth) if config.name in FROM_TRUTH else ()
-    backbone: Backbone = getattr(import_module(module), attribute)(config, *truth)
+    backbone: Backbone = chosen(config, *truth)
     return backbone

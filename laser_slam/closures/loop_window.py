@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from laser_slam.backbones.base import Backbone
 from laser_slam.camera import resize_intrinsics
 from laser_slam.closures.ends import End, frames_around
-from laser_slam.closures.measurement import Measurement, cross
+from laser_slam.closures.measurement import Measurement
 from laser_slam.config import Config
 from laser_slam.errors import DegenerateGeometryError
 from laser_slam.registration import register
-from laser_slam.sim3 import Array, Sim3
+from laser_slam.sim3 import Array, Sim3, cross_matrix
 from laser_slam.types import Image, Prediction, Registration, WindowStatus
 
 # A window bends by more than the frames that it shares with another can show: from the middle of
@@ -102,7 +102,7 @@ def _composed(a_from_b: Sim3, a_from_loop: Sim3, sides: list[Registration]) -> A
     by_b[:3, :3], by_b[6, 6] = -turn, -1.0
     by_b[3:6, 3:6] = -a_from_b.scale * turn
     for slopes in (by_a, by_b):
-        slopes[3:6, :3] = cross(arm) @ slopes[:3, :3]
+        slopes[3:6, :3] = cross_matrix(arm) @ slopes[:3, :3]
         slopes[3:6, 6] = -arm * slopes[6, 6]
     parts = zip((by_a, by_b), sides, strict=True)
     return np.asarray(sum((J * side.sigmas**2) @ J.T for J, side in parts))

@@ -10,17 +10,16 @@ from numpy.typing import NDArray
 
 from laser_slam.closures.correspondences import Correspondences, correspond
 from laser_slam.closures.ends import End, PairMatches
-from laser_slam.closures.measurement import Measurement, cross, moved_by
-from laser_slam.closures.pose_guess import agreement, guess_similarity
+from laser_slam.closures.measurement import Measurement, moved_by
+from laser_slam.closures.pose_guess import COMMON_WIDTH, agreement, guess_similarity
 from laser_slam.config import ClosuresConfig
 from laser_slam.errors import DegenerateGeometryError
-from laser_slam.sim3 import Array, Sim3, rotation_exp
+from laser_slam.sim3 import Array, Sim3, cross_matrix, rotation_exp
 
 _ROUNDS = 15
 _RANK = 1e-12  # of the largest eigenvalue; what is less sure than that is left as guessed
 _CONVERGED = 1e-6  # radians, median depths, log
 _PIXEL_NOISE = 0.5  # of a match, per axis and image, px at 640 wide; at least
-_COMMON_WIDTH = 640
 _DEPTH_NOISE = 0.005  # of a depth, log; at least
 _DEPTH_GROUPS = 4  # by depth: far ones err more
 _REDESCEND = 25.0  # squared misfit, of 3 numbers in sigmas, from which a match has no say
@@ -138,7 +137,8 @@ def _linearise(
     by_point = by_cam @ cam_from_a
     arm = in_a - a_from_b.apply(_pivot(points))
     motion = np.concatenate(
-        [-cross(arm), np.tile(_unit(points) * np.eye(3), (len(arm), 1, 1)), arm[:, :, None]], axis=2
+        [-cross_matrix(arm), np.tile(_unit(points) * np.eye(3), (len(arm), 1, 1)), arm[:, :, None]],
+        axis=2,
     )
     jacobian = by_point @ motion
     turn = a_from_b.scale * (a_from_b.rotation @ other.window_from_cam[:, :, :3])
@@ -179,7 +179,7 @@ def _estimate_noise(points: Correspondences, a_from_b: Sim3, config: ClosuresCon
     """Read the noise off the inliers: pixels across the way that depth errors move them."""
     misfit = points.a.misfit(a_from_b.apply(points.b.points))
     near = np.flatnonzero(agreement(points, a_from_b, config) > 0)
-    least = _PIXEL_NOISE * points.width / _COMMON_WIDTH, _DEPTH_NOISE * np.sqrt(2)
+    least = _PIXEL_NOISE * points.width / COMMON_WIDTH, _DEPTH_NOISE * np.sqrt(2)
     if len(near) < _DEPTH_GROUPS:
         return _Noise(least[0], np.full(len(points), least[1]))
     pixel = min(_spread(misfit[near, :2].ravel()), _spread(_across(points, a_from_b, misfit)[near]))

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from laser_slam.sim3 import Array, Sim3, rotation_exp, rotation_log
+from laser_slam.sim3 import Array, Sim3, cross_matrix, rotation_exp, rotation_log
 
 
 @dataclass(frozen=True)
@@ -85,15 +85,6 @@ def moved_by(point: Array, pivot: Array) -> Array:
     """
     arm = point - pivot
     out = np.eye(7)
-    out[3:6, :3] = -cross(arm)  # w x arm
+    out[3:6, :3] = -cross_matrix(arm)  # w x arm
     out[3:6, 6] = arm
-    return out
-
-
-def cross(vectors: Array) -> Array:
-    """Return the (..., 3, 3) matrices of the cross product with (..., 3) vectors."""
-    out = np.zeros((*vectors.shape, 3))
-    for row, col, axis, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 2, 0, -1)):
-        out[..., row, col] = sign * vectors[..., axis]
-        out[..., col, row] = -out[..., row, col]
     return out

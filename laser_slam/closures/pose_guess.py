@@ -6,6 +6,7 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
+from laser_slam.camera import intrinsics_matrix, poselib_camera
 from laser_slam.closures.correspondences import Correspondences, Views
 from laser_slam.config import ClosuresConfig
 from laser_slam.errors import DegenerateGeometryError
@@ -13,7 +14,7 @@ from laser_slam.sim3 import Array, Sim3, orthonormal
 
 MIN_POINTS = 8  # four determine a pose; the rest must agree
 _RANSAC = {"max_iterations": 2000, "min_iterations": 100, "success_prob": 0.9999, "seed": 0}
-_COMMON_WIDTH = 640  # at which the settings count pixels
+COMMON_WIDTH = 640  # at which the settings count pixels
 
 
 def guess_similarity(points: Correspondences, config: ClosuresConfig) -> Sim3:
@@ -56,7 +57,7 @@ def agreement(points: Correspondences, a_from_b: Sim3, config: ClosuresConfig) -
 
 def inlier_limits(width: int, config: ClosuresConfig) -> Array:
     """Return (3,) how large ``Views.misfit`` of an inlier may be."""
-    pixels = config.max_error_px * width / _COMMON_WIDTH
+    pixels = config.max_error_px * width / COMMON_WIDTH
     return np.array([pixels, pixels, np.log(config.max_depth_ratio)])
 
 
@@ -71,14 +72,9 @@ def _locate(points: Views, seen: Views, width: int, config: ClosuresConfig) -> S
     Returns:
         The similarity from the window of ``seen`` to that of ``points``; None: not found.
     """
-    camera = {
-        "model": "PINHOLE",
-        "width": -1,
-        "height": -1,
-        "params": [*seen.focal[0], *seen.center[0]],
-    }
+    camera = poselib_camera(intrinsics_matrix(*seen.focal[0], *seen.center[0]))
     unit = float(np.median(points.depth))  # thresholds inside must not depend on it
-    max_error = config.max_error_px * width / _COMMON_WIDTH
+    max_error = config.max_error_px * width / COMMON_WIDTH
     options = {**_RANSAC, "max_reproj_error": max_error}
     pose, info = poselib.estimate_absolute_pose(seen.pixels, points.points / unit, camera, options)
     inliers: NDArray[np.bool_] = np.array(info["inliers"], np.bool_)

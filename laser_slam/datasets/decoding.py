@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import warnings
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -14,6 +14,7 @@ from typing import TypeAlias, TypeVar
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 from laser_slam.errors import DatasetError
@@ -250,3 +251,34 @@ def _mostly_unreadable(where: Path, unreadable: int, total: int) -> DatasetError
         f"{unreadable} of the first {total} images of {where} cannot be read; "
         "copy or download them again"
     )
+
+
+def read_depth(
+    path: Path,
+    size: tuple[int, int],
+    units_per_m: float,
+    advice: str,
+    invalid: Sequence[int] = (0,),
+) -> NDArray[np.float32]:
+    """Read a depth map kept as 16-bit grey PNG.
+
+    Args:
+        path: of the file.
+        size: (height, width) that it must have.
+        units_per_m: of the stored numbers.
+        advice: what to do about a broken file.
+        invalid: numbers that stand for unknown depth.
+
+    Returns:
+        (H, W) in metres, NaN: unknown.
+
+    Raises:
+        DatasetError: the file is broken, not 16-bit grey, or of another size.
+    """
+    stored = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), -1)
+    if stored is None or stored.dtype != np.uint16 or stored.shape != size:
+        height, width = size
+        raise DatasetError(f"{path} is no 16-bit grey PNG of {width}x{height} pixels; {advice}")
+    metres: NDArray[np.float32] = stored.astype(np.float32) / np.float32(units_per_m)
+    metres[np.isin(stored, invalid)] = np.nan
+    return metres

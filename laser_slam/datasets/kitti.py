@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +14,7 @@ from laser_slam.datasets.decoding import (
     check_same_kind,
     give_up_if_unreadable,
     read_ahead,
+    read_depth,
     read_image,
 )
 from laser_slam.datasets.intrinsics import check_intrinsics
@@ -82,16 +82,8 @@ class KittiOdometry:
         path = self._folder / "depth" / f"{frame:06d}.png"
         if not path.is_file():
             return None
-        stored = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), -1)
-        if stored is None or stored.dtype != np.uint16 or stored.shape != self._info.size:
-            height, width = self._info.size
-            raise DatasetError(
-                f"{path} is no 16-bit grey PNG of {width}x{height} pixels; write it again, "
-                "or remove the folder 'depth'"
-            )
-        metres: NDArray[np.float32] = stored.astype(np.float32) / np.float32(DEPTH_UNITS_PER_M)
-        metres[stored == 0] = np.nan
-        return metres
+        advice = "write it again, or remove the folder 'depth'"
+        return read_depth(path, self._info.size, DEPTH_UNITS_PER_M, advice)
 
     def _read(self, index: int) -> Frame:
         return Frame(index, float(self._times_s[index]), read_image(self._paths[index]))

@@ -6,7 +6,6 @@ import re
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +15,7 @@ from laser_slam.datasets.decoding import (
     check_same_kind,
     give_up_if_unreadable,
     read_ahead,
+    read_depth,
     read_image,
 )
 from laser_slam.errors import DatasetError
@@ -91,13 +91,7 @@ class SevenScenes:
         path = _beside(self._files[frame], "depth.png")
         if not path.is_file():
             return None
-        stored = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), -1)
-        if stored is None or stored.dtype != np.uint16 or stored.shape != self._info.size:
-            height, width = self._info.size
-            raise DatasetError(f"{path} is no 16-bit grey PNG of {width}x{height} pixels; {AGAIN}")
-        metres: NDArray[np.float32] = stored.astype(np.float32) / np.float32(UNITS_PER_M)
-        metres[np.isin(stored, INVALID)] = np.nan
-        return metres
+        return read_depth(path, self._info.size, UNITS_PER_M, AGAIN, INVALID)
 
 
 def _read(index: int, number: int, path: Path) -> Frame:

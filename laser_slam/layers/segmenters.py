@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from laser_slam.dependencies import import_named
 from laser_slam.errors import ConfigError
 from laser_slam.types import Image, Prediction
 
@@ -46,13 +46,8 @@ def make_segmenter(config: SegmentationConfig) -> Segmenter:
     Raises:
         ConfigError: no segmenter has this name.
     """
-    if config.segmenter not in SEGMENTERS:
-        raise ConfigError(
-            f"layers.segmentation.segmenter: no '{config.segmenter}'; "
-            f"there is {', '.join(SEGMENTERS)}"
-        )
-    module, _, attribute = SEGMENTERS[config.segmenter].partition(":")
-    segmenter: Segmenter = getattr(import_module(module), attribute)(config)
+    setting = "layers.segmentation.segmenter"
+    segmenter: Segmenter = import_named(SEGMENTERS, config.segmenter, setting)(config)
     return segmenter
 
 

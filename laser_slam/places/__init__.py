@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
-from laser_slam.errors import ConfigError
+from laser_slam.dependencies import import_named
 from laser_slam.places.backbone import BACKBONE, describe_by_tokens
 from laser_slam.places.candidates import Candidate, CandidateSearch, Place
 from laser_slam.places.index import PlaceIndex
@@ -43,11 +42,6 @@ def make_descriptor(config: PlacesConfig) -> Descriptor:
     Raises:
         ConfigError: no descriptor has this name.
     """
-    if config.descriptor not in DESCRIPTORS:
-        raise ConfigError(
-            f"places.descriptor: no '{config.descriptor}'; "
-            f"there is {', '.join([*DESCRIPTORS, BACKBONE])}"
-        )
-    module, _, attribute = DESCRIPTORS[config.descriptor].partition(":")
-    descriptor: Descriptor = getattr(import_module(module), attribute)(config)
+    chosen = import_named(DESCRIPTORS, config.descriptor, "places.descriptor", [BACKBONE])
+    descriptor: Descriptor = chosen(config)
     return descriptor

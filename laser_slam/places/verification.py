@@ -9,6 +9,7 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
+from laser_slam.camera import poselib_camera
 from laser_slam.config.places import VerificationConfig
 from laser_slam.sim3 import Array
 from laser_slam.types import Image
@@ -144,12 +145,7 @@ def _fit_motion(
     if intrinsics is None:
         _, info = poselib.estimate_fundamental(first, second, options)
         return None, np.array(info["inliers"], np.bool_)
-    camera = {
-        "model": "PINHOLE",
-        "width": -1,
-        "height": -1,
-        "params": [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]],
-    }
+    camera = poselib_camera(intrinsics)
     pose, info = poselib.estimate_relative_pose(first, second, camera, camera, options)
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = pose.R, pose.t

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.registration.scale import FRAMES_ALIKE, Pixels
-from laser_slam.sim3 import Sim3, rotation_log, umeyama
+from laser_slam.sim3 import Sim3, cross_matrix, rotation_log, umeyama
 
 Array = NDArray[np.float64]
 
@@ -146,9 +146,13 @@ def sigmas(cameras: Cameras, fit: Fit, log_scale_sigma: float) -> Array:
         (7,) as in ``Registration.sigmas``.
     """
     anchors = _anchors(cameras.target, fit.axes)
-    motion = np.concatenate([-_cross(anchors), np.broadcast_to(np.eye(3), (*anchors.shape, 3))], -1)
+    motion = np.concatenate(
+        [-cross_matrix(anchors), np.broadcast_to(np.eye(3), (*anchors.shape, 3))], -1
+    )
     arms = anchors - cameras.target[:, None, :3, 3]
-    noise = np.concatenate([np.broadcast_to(np.eye(3), (*arms.shape, 3)), -_cross(arms)], axis=-1)
+    noise = np.concatenate(
+        [np.broadcast_to(np.eye(3), (*arms.shape, 3)), -cross_matrix(arms)], axis=-1
+    )
     hessian = np.einsum("k,kaij,kail->jl", fit.weights, motion, motion)
     gain = np.linalg.solve(hessian, np.einsum("k,kaij,kail->kjl", fit.weights, motion, noise))
     sigma = np.repeat([fit.center_sigma, fit.rotation_sigma], 3)
@@ -156,12 +160,3 @@ def sigmas(cameras: Cameras, fit: Fit, log_scale_sigma: float) -> Array:
     lever = fit.rigid.rotation @ np.average(cameras.source[:, :3, 3], axis=0, weights=fit.weights)
     variances[3:] += (lever * log_scale_sigma) ** 2
     return np.append(np.sqrt(variances), log_scale_sigma)
-
-
-def _cross(vectors: Array) -> Array:
-    """Return the (..., 3, 3) matrices of the cross product with (..., 3) vectors."""
-    out = np.zeros((*vectors.shape, 3))
-    for row, col, axis, sign in ((0, 1, 2, -1), (0, 2, 1, 1), (1, 2, 0, -1)):
-        out[..., row, col] = sign * vectors[..., axis]
-        out[..., col, row] = -out[..., row, col]
-    return out

@@ -11,7 +11,16 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from laser_slam.report.style import INK, MUTED, SECOND, WIDTH_PX, mark_ends, picture
+from laser_slam.report.style import (
+    INK,
+    MUTED,
+    SECOND,
+    WIDTH_PX,
+    ground_plan,
+    limits_around,
+    mark_ends,
+    picture,
+)
 from laser_slam.types import Trajectory
 
 Array = NDArray[np.float64]
@@ -33,8 +42,8 @@ def trajectory_picture(path: Path, estimate: Trajectory, truth: Trajectory | Non
     Raises:
         RunFolderError: the picture cannot be written.
     """
-    known = [_ground(estimate)] + ([_ground(truth)] if truth is not None else [])
-    low, high = _limits(np.concatenate(known))
+    known = [ground_plan(estimate)] + ([ground_plan(truth)] if truth is not None else [])
+    low, high = limits_around(np.concatenate(known), 0.2)
     ratio = float((high[1] - low[1]) / (high[0] - low[0]))
     unit = "world units" if truth is None else "m"
     with picture(path, int(np.clip(0.8 * WIDTH_PX * ratio + 150, 620, 1500))) as figure:
@@ -42,11 +51,11 @@ def trajectory_picture(path: Path, estimate: Trajectory, truth: Trajectory | Non
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         axes.set(xlabel=f"x, right ({unit})", ylabel=f"z, forward ({unit})")
         if truth is not None:
-            axes.plot(*_ground(truth).T, color="#b4bcc4", linewidth=4, label="truth", zorder=2)
+            axes.plot(*ground_plan(truth).T, color="#b4bcc4", linewidth=4, label="truth", zorder=2)
             _draw_by_error(figure, axes, estimate, truth)
         else:
-            axes.plot(*_ground(estimate).T, color=SECOND, linewidth=2, label="estimate")
-        mark_ends(axes, _ground(estimate))
+            axes.plot(*ground_plan(estimate).T, color=SECOND, linewidth=2, label="estimate")
+        mark_ends(axes, ground_plan(estimate))
         axes.legend(loc="best")
 
 
@@ -93,24 +102,11 @@ def stages_picture(path: Path, seconds_by_stage: Mapping[str, float]) -> None:
         axes.grid(visible=False, axis="y")
 
 
-def _ground(trajectory: Trajectory) -> Array:
-    """Return the (N, 2) x and z of the camera centres."""
-    return trajectory.world_from_cam[:, [0, 2], 3]
-
-
-def _limits(points: Array) -> tuple[Array, Array]:
-    """Return lower and upper corner around the points; a straight drive still gets some width."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    extent = float(max((high - low).max(), 1e-9))
-    middle, half = (low + high) / 2, np.maximum((high - low) / 2, 0.2 * extent) + 0.06 * extent
-    return middle - half, middle + half
-
-
 def _draw_by_error(figure: Figure, axes: Axes, estimate: Trajectory, truth: Trajectory) -> None:
     _, in_estimate, in_truth = np.intersect1d(estimate.frames, truth.frames, return_indices=True)
     centers = estimate.world_from_cam[in_estimate, :3, 3]
     error = np.linalg.norm(centers - truth.world_from_cam[in_truth, :3, 3], axis=1)
-    ground = _ground(estimate)[in_estimate]
+    ground = ground_plan(estimate)[in_estimate]
     segments = np.stack([ground[:-1], ground[1:]], axis=1)
     line = LineCollection(list(segments), cmap=_ERROR_COLORS, linewidths=2.2, zorder=3)
     line.set_array((error[:-1] + error[1:]) / 2)

@@ -14,7 +14,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
-from laser_slam.report.style import ACCENT, SECOND, WIDTH_PX, mark_ends, picture
+from laser_slam.report.style import (
+    ACCENT,
+    SECOND,
+    WIDTH_PX,
+    ground_plan,
+    limits_around,
+    mark_ends,
+    picture,
+)
 from laser_slam.types import Trajectory
 
 Array = NDArray[np.float64]
@@ -71,7 +79,9 @@ def loops_picture(path: Path, paths: LoopPaths) -> None:
         RunFolderError: the picture cannot be written.
     """
     known = [paths.chained, paths.closed] + ([paths.truth] if paths.truth is not None else [])
-    low, high = _limits(np.concatenate([_ground(trajectory) for trajectory in known]))
+    low, high = limits_around(
+        np.concatenate([ground_plan(trajectory) for trajectory in known]), 0.15
+    )
     ratio = float((high[1] - low[1]) / (high[0] - low[0]))
     is_wide = ratio < 0.5
     columns, rows = (1, 2) if is_wide else (2, 1)
@@ -134,13 +144,13 @@ def _draw_scales(axes: Axes, curves: ScaleCurves, factor: Array) -> None:
 
 def _draw_panel(axes: Axes, estimate: Trajectory, paths: LoopPaths) -> None:
     if paths.truth is not None:
-        axes.plot(*_ground(paths.truth).T, color=TRUTH, linewidth=4, label="truth", zorder=1)
-    axes.plot(*_ground(estimate).T, color=SECOND, linewidth=1.8, label="estimate", zorder=3)
+        axes.plot(*ground_plan(paths.truth).T, color=TRUTH, linewidth=4, label="truth", zorder=1)
+    axes.plot(*ground_plan(estimate).T, color=SECOND, linewidth=1.8, label="estimate", zorder=3)
     rejected, accepted = (_lines(estimate, pairs) for pairs in (paths.rejected, paths.accepted))
     crowd = float(np.clip(60 / max(len(rejected), 1), 0.15, 0.8))
     _join(axes, rejected, f"rejected ({len(rejected)})", (REJECTED, 0.7, crowd, 2))
     _join(axes, accepted, f"closed ({len(accepted)})", (ACCEPTED, 1.8, 0.9, 4))
-    mark_ends(axes, _ground(estimate))
+    mark_ends(axes, ground_plan(estimate))
 
 
 def _join(axes: Axes, lines: Array, label: str, look: tuple[str, float, float, int]) -> None:
@@ -158,7 +168,7 @@ def _lines(estimate: Trajectory, pairs: Pairs) -> Array:
     """Return the (N, 2, 2) ends, from above, of the pairs whose frames have poses."""
     known = np.isin(pairs, estimate.frames).all(axis=1)
     rows = np.searchsorted(estimate.frames, pairs[known])
-    return _ground(estimate)[rows].reshape(-1, 2, 2)
+    return ground_plan(estimate)[rows].reshape(-1, 2, 2)
 
 
 def _rmse_text(estimate: Trajectory, truth: Trajectory | None) -> str:
@@ -169,19 +179,6 @@ def _rmse_text(estimate: Trajectory, truth: Trajectory | None) -> str:
     if not len(apart):
         return ""
     return f": {np.sqrt(np.mean(np.sum(apart**2, axis=1))):.2f} m RMSE"
-
-
-def _ground(trajectory: Trajectory) -> Array:
-    """Return the (N, 2) x and z of the camera centres."""
-    return trajectory.world_from_cam[:, [0, 2], 3]
-
-
-def _limits(points: Array) -> tuple[Array, Array]:
-    """Return lower and upper corner around the points; a straight drive still gets some width."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    extent = float(max((high - low).max(), 1e-9))
-    middle, half = (low + high) / 2, np.maximum((high - low) / 2, 0.15 * extent) + 0.06 * extent
-    return middle - half, middle + half
 
 
 def frame_pairs(pairs: Sequence[tuple[int, int]]) -> Pairs:

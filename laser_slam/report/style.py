@@ -16,6 +16,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 
 from laser_slam.store import atomic_write
+from laser_slam.types import Trajectory
+
+Array = NDArray[np.float64]
 
 DPI = 150
 WIDTH_PX = 1200
@@ -87,3 +90,21 @@ def mark_ends(axes: Axes, path: NDArray[np.float64]) -> None:
     marks: dict[str, Any] = {"s": 64, "zorder": 5, "edgecolors": "white", "linewidths": 1.5}
     axes.scatter(path[:1, 0], path[:1, 1], marker="o", color=INK, label="start", **marks)
     axes.scatter(path[-1:, 0], path[-1:, 1], marker="s", color=ACCENT, label="end", **marks)
+
+
+def ground_plan(trajectory: Trajectory) -> Array:
+    """Return the (N, 2) x and z of the camera centres."""
+    return trajectory.world_from_cam[:, [0, 2], 3]
+
+
+def limits_around(points: Array, least: float) -> tuple[Array, Array]:
+    """Return lower and upper corner around (N, 2) points, with a margin.
+
+    Args:
+        points: of a path.
+        least: half of the width, in extents, that even a straight path gets.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    extent = float(max((high - low).max(), 1e-9))
+    middle, half = (low + high) / 2, np.maximum((high - low) / 2, least * extent) + 0.06 * extent
+    return middle - half, middle + half

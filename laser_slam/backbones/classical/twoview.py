@@ -9,6 +9,7 @@ import poselib
 from numpy.typing import NDArray
 
 from laser_slam.backbones.classical.tracking import FrameTracks
+from laser_slam.camera import poselib_camera
 from laser_slam.sim3 import Array, orthonormal
 
 GAPS = (2, 3, 4, 6, 8, 12)  # frames between the two views of a starting pair
@@ -87,16 +88,6 @@ def choose_pair(views: list[FrameTracks], intrinsics: Array) -> tuple[int, int] 
     return best
 
 
-def camera_dict(intrinsics: Array) -> dict[str, object]:
-    """Describe a pinhole camera as poselib wants it.
-
-    It applies the parameters as they are, so pixel centres stay where ours are: at integers. Width
-    and height must be there, and nothing reads them.
-    """
-    params = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
-    return {"model": "PINHOLE", "width": 0, "height": 0, "params": params}
-
-
 def relative_pose(
     first: FrameTracks, second: FrameTracks, intrinsics: Array, max_error_px: float
 ) -> tuple[Array, Array, int]:
@@ -106,7 +97,7 @@ def relative_pose(
         (3, 3) rotation, (3,) unit translation, number of inliers.
     """
     a, b, _ = match(first, second)
-    camera = camera_dict(intrinsics)
+    camera = poselib_camera(intrinsics)
     options = {"max_epipolar_error": max_error_px, "seed": 0, "max_iterations": 2000}
     pose, info = poselib.estimate_relative_pose(a, b, camera, camera, options, {})
     translation = np.asarray(pose.t, dtype=np.float64)
@@ -124,6 +115,6 @@ def absolute_pose(
     """
     options = {"max_reproj_error": max_error_px, "seed": 0, "max_iterations": 1000}
     pose, info = poselib.estimate_absolute_pose(
-        pixels, points, camera_dict(intrinsics), options, {}
+        pixels, points, poselib_camera(intrinsics), options, {}
     )
     return np.asarray(pose.R), np.asarray(pose.t), int(info["num_inliers"])
