@@ -2,6 +2,7 @@
 
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,6 +120,9 @@ class TrueBackbone:
     calls: int = 0
     remembers: bool = False
     sees_far_frames: bool = True
+
+    def identity(self) -> dict[str, Any]:
+        return {"corridor": 1}
 
     def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
         return size

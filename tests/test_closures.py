@@ -342,7 +342,7 @@ class Blind:
 
     def __init__(self, inner: Backbone, *, sees_far_frames: bool) -> None:
         self._inner = inner
-        self.image_size = inner.image_size
+        self.image_size, self.identity = inner.image_size, inner.identity
         self.calibrate = inner.calibrate
         self.sees_far_frames = sees_far_frames
 

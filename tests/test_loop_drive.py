@@ -72,6 +72,7 @@ class Network:
         self._answers, self._interrupt_at = answers, interrupt_at
         self.intrinsics: list[NDArray[np.float64] | None] = []
         self.image_size, self.calibrate = self._real.image_size, self._real.calibrate
+        self.identity = self._real.identity
 
     def predict(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,14 @@ class Backbone(Protocol):
         """Tell whether ``predict`` takes frames that do not follow one another.
 
         A window of two visits of a place then measures how they lie to one another.
+        """
+        ...
+
+    def identity(self) -> dict[str, Any]:
+        """Return what its predictions depend on beside the images, as plain YAML values.
+
+        Such as settings that matter, size rules, the hash of a checkpoint: predictions of equal
+        identity may be mixed, others not.
         """
         ...
 

@@ -1,20 +1,19 @@
 """Every setting, and how settings are read."""
 
+from laser_slam.config.backbones import BackboneConfig, ClassicalConfig, ReplayConfig
 from laser_slam.config.closures import ClosuresConfig
+from laser_slam.config.fusion import FusionConfig
+from laser_slam.config.layers import LayersConfig, SegmentationConfig
 from laser_slam.config.loading import dump_config, load_config, setting_names, shipped_configs
+from laser_slam.config.networks import NetworkConfig, Pi3XConfig
 from laser_slam.config.places import PlacesConfig, VerificationConfig
 from laser_slam.config.sections import (
-    BackboneConfig,
     CalibrationConfig,
-    ClassicalConfig,
     Config,
     DatasetConfig,
-    FusionConfig,
-    LayersConfig,
     PoseGraphConfig,
     RegistrationConfig,
     RunConfig,
-    SegmentationConfig,
     SyntheticConfig,
     WindowsConfig,
 )
@@ -29,9 +28,12 @@ __all__ = [
     "DatasetConfig",
     "FusionConfig",
     "LayersConfig",
+    "NetworkConfig",
+    "Pi3XConfig",
     "PlacesConfig",
     "PoseGraphConfig",
     "RegistrationConfig",
+    "ReplayConfig",
     "RunConfig",
     "SegmentationConfig",
     "SimulatedConfig",

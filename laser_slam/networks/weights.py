@@ -28,6 +28,7 @@ class Checkpoint:
         url: where it is published.
         size: of the file, with its unit.
         licence: of the weights.
+        repo: on the Hugging Face hub that has the file; empty: it is not there.
     """
 
     setting: str
@@ -35,6 +36,7 @@ class Checkpoint:
     url: str
     size: str
     licence: str
+    repo: str = ""
 
     @property
     def advice(self) -> str:

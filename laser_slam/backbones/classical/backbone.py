@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import cv2
 import numpy as np
@@ -47,6 +48,10 @@ class ClassicalBackbone:
         self._longest = 0  # frames of a window, for which there is memory
         self._tracker = Tracker(self._config, memory=0)
         self._poses: Poses = {}  # in the axes and the unit of the last window's solution
+
+    def identity(self) -> dict[str, Any]:
+        """Return its settings; see `laser_slam.backbones.base.Backbone`."""
+        return self._config.model_dump(mode="json")
 
     def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return the (height, width) at which it wants images of (height, width) ``size``."""

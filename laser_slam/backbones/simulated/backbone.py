@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +82,10 @@ class SimulatedBackbone:
             level_axes(settle_down(upright, samples.depths, K, samples.world_from_cam)),
             np.uint64(partition.integers(1 << 62)),
         )
+
+    def identity(self) -> dict[str, Any]:
+        """Return its settings; see `laser_slam.backbones.base.Backbone`."""
+        return self._config.model_dump(mode="json")
 
     def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return the (height, width) of the depth maps: whole patches high, as networks want."""

@@ -1,0 +1,29 @@
+"""The settings of the map."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from laser_slam.config.section import Section
+
+
+class FusionConfig(Section):
+    """Submaps to one coloured cloud."""
+
+    min_confidence: float = Field(0.5, ge=0, le=1, description="pixels below it stay out")
+    max_range: float = Field(
+        3.0, gt=0, description="depth beyond which pixels stay out, in median depths of the window"
+    )
+    edge_jump: float = Field(
+        0.05, gt=0, description="depth step between neighbours that makes an edge, in its depth"
+    )
+    stride: int = Field(1, ge=1, description="every so many-th row and column is used")
+    voxel_size: float = Field(
+        0.0, ge=0, description="edge of the averaging voxels in world units; 0: auto_voxel decides"
+    )
+    auto_voxel: float = Field(
+        0.006, gt=0, description="edge of the voxels, in median depths of the first good window"
+    )
+    min_observations: int = Field(
+        8, ge=1, description="views that a voxel and its 26 neighbours need in sum; fewer: noise"
+    )
