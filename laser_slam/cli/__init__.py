@@ -1,0 +1,11 @@
+"""The command line: one module for each kind of command, heavy imports inside the commands."""
+
+from laser_slam.cli import sources, stored
+from laser_slam.cli.app import app
+
+__all__ = ["app", "main", "sources", "stored"]
+
+
+def main() -> None:
+    """Run the command line."""
+    app(prog_name="laser-slam")

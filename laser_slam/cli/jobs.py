@@ -1,0 +1,47 @@
+"""What is done with a data set: map it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import typer
+
+from laser_slam.cli.app import INTERRUPTED, RunOptions
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from laser_slam.config import Config
+    from laser_slam.datasets.base import Dataset
+
+
+@dataclass(frozen=True)
+class MapOptions(RunOptions):
+    """Options of a whole run."""
+
+    def work(self, dataset: Dataset, config: Config) -> None:
+        """Map the data set."""
+        from laser_slam.console import print_summary, progress_display
+        from laser_slam.pipeline import Pipeline
+
+        with progress_display(quiet=self.quiet) as on_progress:
+            pipeline = Pipeline(dataset, config, self.out, on_progress=on_progress)
+            try:
+                results = pipeline.run()
+            except KeyboardInterrupt as error:
+                text = _how_to_go_on(pipeline.folder, remembers=pipeline.backbone.remembers)
+                typer.echo(text, err=True)
+                raise typer.Exit(INTERRUPTED) from error
+        print_summary(results.report, results.folder)
+
+
+def _how_to_go_on(folder: Path, *, remembers: bool) -> str:
+    kept = len(list((folder / "windows").glob("*.npz")))
+    if kept == 0:
+        return "laser-slam: interrupted; nothing is kept"
+    way = "starts again there, for this backbone needs the windows before"
+    return (
+        f"laser-slam: interrupted; {kept} windows are kept in {folder}; "
+        f"the same command with --out {folder} {way if remembers else 'goes on'}"
+    )
