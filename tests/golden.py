@@ -28,13 +28,32 @@ UNIT = 1.0 / math.sqrt(4 * (65536.0**2 - 1) / 12)
 # The first pattern that fits wins. 'mul': scale / sqrt(fan in) for weights of two or more
 # dimensions, 0.02 scale for others; 'one': scale (1 + 0.1 noise); 'raw': scale.
 RULES = [
-    (r"(pos_embed|cls_token|mask_token|register_tokens)$", "raw", STREAM),
-    (r"(^|\.)patch_embed\.proj\.(weight|bias)$", "mul", STREAM),
-    (r"^(encoder|aggregator\.patch_embed)\.norm\.weight$", "one", STREAM),
-    (r"^(encoder|aggregator\.patch_embed)\.norm\.bias$", "raw", 0.02 * STREAM),
+    (r"(pos_embed|cls_token|mask_token|register_tokens?|camera_token)$", "raw", STREAM),
+    (r"^(metric_token|depth_emb)$", "raw", STREAM),
+    (r"(^|\.)(patch_embed|ray_embed)\.proj\.(weight|bias)$", "mul", STREAM),
+    (r"^(encoder|depth_encoder|aggregator\.patch_embed)\.norm\.weight$", "one", STREAM),
+    (r"^(encoder|depth_encoder|aggregator\.patch_embed)\.norm\.bias$", "raw", 0.02 * STREAM),
+    (r"^camera_head\.trunk\.\d+\.ls[12]\.gamma$", "one", 0.5 * STREAM),
     (r"\.gamma$", "one", 0.25 * STREAM),
+    (r"^camera_head\.token_norm\.weight$", "one", STREAM),
+    (r"^camera_head\.token_norm\.bias$", "raw", 0.02 * STREAM),
+    (r"^camera_head\.poseLN_modulation\.1\.(weight|bias)$", "mul", 0.15),
+    (r"^camera_head\.pose_branch\.fc2\.weight$", "mul", 0.4),
+    (r"^(point_head|conf_head)\.proj\.weight$", "mul", 0.3),
+    (r"^camera_head\.fc_(t|rot)\.weight$", "mul", 0.5),
+    (r"^metric_head\.weight$", "mul", 0.3),
     (r"(^|\.)aggregator\.score\.3\.weight$", "mul", 2.0),
 ]
+# Queries and keys that a norm follows are small, so that its epsilon shows.
+NORMED = re.compile(
+    r"^(decoder|aggregator\.(frame|global)_blocks|pose_inject_blk)\.\d+\.attn\.qkv\.(weight|bias)$"
+)
+NORMED_SCALE = np.float32(0.05)
+# Added, so that poses are well conditioned: fields of view, and the diagonal of a rotation.
+OFFSETS = {
+    "camera_head.pose_branch.fc2.bias": [0, 0, 0, 0, 0, 0, 0.25, 0.25, 0.25],
+    "camera_head.fc_rot.bias": [0.5, 0, 0, 0, 0.5, 0, 0, 0, 0.5],
+}
 
 
 class Case(NamedTuple):
@@ -56,6 +75,12 @@ def load_case(model: str, name: str) -> Case:
     with np.load(DATA / model / f"case_{name}.npz", allow_pickle=False) as file:
         expected = {key: file[key] for key in file.files}
     return Case(torch.from_numpy(images), meta.get("token_stride", 1), expected)
+
+
+def load_functions() -> dict[str, Array]:
+    """Return inputs and outputs of single functions."""
+    with np.load(DATA / "functions" / "functions.npz", allow_pickle=False) as file:
+        return {key: file[key] for key in file.files}
 
 
 def relative_difference(found: torch.Tensor, expected: Array) -> float:
@@ -85,6 +110,10 @@ def make_weights(name: str, shape: list[int]) -> Array:
         values = np.float32(scale) + noise * np.float32(0.1 * scale * UNIT)
     else:
         values = noise * np.float32(scale * UNIT)
+    if NORMED.search(name):
+        values[: 2 * len(values) // 3] *= NORMED_SCALE
+    if name in OFFSETS:
+        values = values + np.asarray(OFFSETS[name], np.float32)
     return np.asarray(values, np.float32).reshape(shape)
 
 

@@ -174,6 +174,16 @@ def test_weights_may_be_kept_in_half_and_come_back_from_half(tmp_path: Path) -> 
         assert {value.dtype for value in encoder.state_dict().values()} == {dtype}
 
 
+def test_weights_may_be_kept_in_half_in_part(tmp_path: Path) -> None:
+    encoder = unfilled()
+    path = save(tiny_tensors(), tmp_path / "tiny.pt")
+    kinds = {True: torch.bfloat16, False: torch.float32}
+    load_weights(encoder, str(path), CHECKPOINT, dtype=lambda key: kinds[key.startswith("blocks.")])
+    loaded = encoder.state_dict()
+    assert loaded["blocks.1.norm2.weight"].dtype == torch.bfloat16
+    assert loaded["norm.weight"].dtype == torch.float32
+
+
 def test_weights_below_the_name_of_a_training_framework_are_found(tmp_path: Path) -> None:
     path = tmp_path / "trained.ckpt"
     torch.save({"epoch": 3, "state_dict": tiny_tensors()}, path)

@@ -14,6 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from laser_slam.networks.transformer import Block, BlockConfig
+
 IMAGE_MEAN = (0.485, 0.456, 0.406)  # of ImageNet: red, green, blue in [0, 1]
 IMAGE_STD = (0.229, 0.224, 0.225)
 PATCH = 14  # side, px
@@ -76,7 +78,8 @@ class Encoder(nn.Module):
         if config.num_registers:
             self.register_tokens = nn.Parameter(torch.zeros(1, config.num_registers, width))
         self.patch_embed = PatchEmbedding(width)
-        self.blocks = nn.ModuleList(Block(width, config.num_heads) for _ in range(config.depth))
+        shape = BlockConfig(width, config.num_heads, eps=NORM_EPS)
+        self.blocks = nn.ModuleList(Block(shape) for _ in range(config.depth))
         self.norm = nn.LayerNorm(width, eps=NORM_EPS)
 
     def forward(self, images: Tensor) -> Tokens:
@@ -142,75 +145,6 @@ class PatchEmbedding(nn.Module):
         """Return (B, h w, D) tokens, row by row, of (B, 3, H, W) images in [0, 1]."""
         maps: Tensor = self.proj(normalise(images).to(self.proj.weight.dtype))
         return maps.flatten(2).transpose(1, 2)
-
-
-class Block(nn.Module):
-    """Attention, then a two-layer perceptron; each adds its scaled result to the tokens."""
-
-    def __init__(self, width: int, num_heads: int) -> None:
-        """Build a block for tokens of ``width`` channels."""
-        super().__init__()
-        self.norm1 = nn.LayerNorm(width, eps=NORM_EPS)
-        self.attn = Attention(width, num_heads)
-        self.ls1 = LayerScale(width)
-        self.norm2 = nn.LayerNorm(width, eps=NORM_EPS)
-        self.mlp = Perceptron(width)
-        self.ls2 = LayerScale(width)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        """Return (B, T, D) tokens for (B, T, D)."""
-        tokens = tokens + self.ls1(self.attn(self.norm1(tokens)))
-        out: Tensor = tokens + self.ls2(self.mlp(self.norm2(tokens)))
-        return out
-
-
-class Attention(nn.Module):
-    """Attention of all tokens of an image to one another, in fused form."""
-
-    def __init__(self, width: int, num_heads: int) -> None:
-        """Build it for tokens of ``width`` channels, which the heads share."""
-        super().__init__()
-        self.num_heads = num_heads
-        self.qkv = nn.Linear(width, 3 * width)
-        self.proj = nn.Linear(width, width)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        """Return (B, T, D) for (B, T, D)."""
-        batch, length, width = tokens.shape
-        channels = width // self.num_heads
-        heads = self.qkv(tokens).view(batch, length, 3, self.num_heads, channels)
-        query, key, value = heads.permute(2, 0, 3, 1, 4)
-        mixed = functional.scaled_dot_product_attention(query, key, value)
-        out: Tensor = self.proj(mixed.transpose(1, 2).flatten(2))
-        return out
-
-
-class Perceptron(nn.Module):
-    """Two layers, four times as wide between them."""
-
-    def __init__(self, width: int) -> None:
-        """Build it for tokens of ``width`` channels."""
-        super().__init__()
-        self.fc1 = nn.Linear(width, 4 * width)
-        self.fc2 = nn.Linear(4 * width, width)
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        """Return (B, T, D) for (B, T, D)."""
-        out: Tensor = self.fc2(functional.gelu(self.fc1(tokens)))
-        return out
-
-
-class LayerScale(nn.Module):
-    """A learnt factor for each channel."""
-
-    def __init__(self, width: int) -> None:
-        """Start from zero: the factors are to be loaded."""
-        super().__init__()
-        self.gamma = nn.Parameter(torch.zeros(width))
-
-    def forward(self, tokens: Tensor) -> Tensor:
-        """Return (..., D) for (..., D)."""
-        return tokens * self.gamma
 
 
 def normalise(images: Tensor) -> Tensor:

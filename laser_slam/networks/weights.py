@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,7 +50,7 @@ def load_weights(
     checkpoint: Checkpoint,
     *,
     unused: Sequence[str] = (),
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | Callable[[str], torch.dtype] = torch.float32,
 ) -> None:
     """Give a network the tensors of a file, which become its own without another copy.
 
@@ -60,7 +60,8 @@ def load_weights(
         path: a .safetensors file, or what ``torch.save`` wrote (.pt, .pth, .ckpt).
         checkpoint: what the file should be, for the error.
         unused: keys of the file that the network has no place for.
-        dtype: that the weights get; the file may hold another floating one.
+        dtype: that the weights get, one for all or by their keys; the file may hold another
+            floating one.
 
     Raises:
         WeightsError: no such file, not readable, or of another network.
@@ -83,14 +84,21 @@ def load_weights(
     module.load_state_dict(tensors, assign=True)
 
 
-def read_tensors(file: Path, dtype: torch.dtype) -> dict[str, Tensor]:
+def read_tensors(
+    file: Path, dtype: torch.dtype | Callable[[str], torch.dtype]
+) -> dict[str, Tensor]:
     """Read all tensors of a file; floating ones become ``dtype``, one by one to save memory.
 
     Nothing but tensors is ever unpickled.
     """
     is_safe = file.suffix == ".safetensors"
     pairs = _read_safetensors(file) if is_safe else _read_torch(file).items()
-    return {key: value.to(dtype) if value.is_floating_point() else value for key, value in pairs}
+    return {
+        key: value.to(dtype(key) if callable(dtype) else dtype)
+        if value.is_floating_point()
+        else value
+        for key, value in pairs
+    }
 
 
 def find_differences(wanted: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> str:
