@@ -273,6 +273,7 @@ class Cloud:
         weights: (N,) summed confidence of the pixels behind each point.
         voxel_size: edge of the voxels that the points were averaged in, in world units, which
             is about their distance to each other; 0: unknown.
+        normals: (N, 3) unit normals of the surface, towards the cameras; None: unknown.
 
     Raises:
         ValueError: shapes disagree or a point is not finite.
@@ -282,6 +283,7 @@ class Cloud:
     colors: NDArray[np.uint8]
     weights: NDArray[np.float32]
     voxel_size: float = 0.0
+    normals: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         """Check shapes and finiteness once, here."""
@@ -290,5 +292,7 @@ class Cloud:
             raise ValueError(f"points {self.points.shape}, colors {self.colors.shape}")
         if self.weights.shape != (num,):
             raise ValueError(f"a cloud of {num} points needs as many weights")
+        if self.normals is not None and self.normals.shape != (num, 3):
+            raise ValueError(f"points {self.points.shape}, normals {self.normals.shape}")
         if not np.isfinite(self.points).all():
             raise ValueError("the points of a cloud must be finite")

@@ -2,6 +2,7 @@
 
 from laser_slam.store.files import atomic_write, write_text
 from laser_slam.store.run import link_latest, new_run_folder, open_run_folder
+from laser_slam.store.tiles import Tile, TileEntry, TileFiles, TileIndex
 from laser_slam.store.windows import (
     FORMAT_VERSION,
     WindowFiles,
@@ -13,6 +14,10 @@ from laser_slam.store.windows import (
 
 __all__ = [
     "FORMAT_VERSION",
+    "Tile",
+    "TileEntry",
+    "TileFiles",
+    "TileIndex",
     "WindowFiles",
     "atomic_write",
     "link_latest",
