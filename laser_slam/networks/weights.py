@@ -59,7 +59,8 @@ def load_weights(
             Buffers that are not in the file must not be on it.
         path: a .safetensors file, or what ``torch.save`` wrote (.pt, .pth, .ckpt).
         checkpoint: what the file should be, for the error.
-        unused: keys of the file that the network has no place for.
+        unused: keys of the file that the network has no place for; one that ends in a dot stands
+            for all that begin with it.
         dtype: that the weights get, one for all or by their keys; the file may hold another
             floating one.
 
@@ -73,8 +74,9 @@ def load_weights(
         raise WeightsError(f"{checkpoint.setting}: {found}; {checkpoint.advice} and give its path")
     with _told_as_weights_error(file, checkpoint):
         tensors = read_tensors(file, dtype)
-    for key in unused:
-        tensors.pop(key, None)
+    below = tuple(name for name in unused if name.endswith("."))
+    for key in [key for key in tensors if key in unused or key.startswith(below)]:
+        del tensors[key]
     differences = find_differences(module.state_dict(), tensors)
     if differences:
         raise WeightsError(
