@@ -18,6 +18,7 @@ from laser_slam.networks.transformer import Block, BlockConfig
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)  # of ImageNet: red, green, blue in [0, 1]
 IMAGE_STD = (0.229, 0.224, 0.225)
+NORMALISATION = {"image_mean": IMAGE_MEAN, "image_std": IMAGE_STD}  # as some checkpoints hold them
 PATCH = 14  # side, px
 NORM_EPS = 1e-6
 EXTRA = 0.1  # cells; part of the factor by which 'factor' resamples

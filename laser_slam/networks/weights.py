@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from laser_slam.errors import DependencyError, WeightsError
 
 WRAPPERS = ("state_dict", "model")  # names under which training frameworks keep the tensors
+ROUNDING = 0.01  # of a constant in half precision, and more than that
 NUM_NAMED = 3  # keys of a kind that an error names
 
 
@@ -50,6 +51,7 @@ def load_weights(
     checkpoint: Checkpoint,
     *,
     unused: Sequence[str] = (),
+    constants: Mapping[str, Sequence[float]] | None = None,
     dtype: torch.dtype | Callable[[str], torch.dtype] = torch.float32,
 ) -> None:
     """Give a network the tensors of a file, which become its own without another copy.
@@ -61,6 +63,7 @@ def load_weights(
         checkpoint: what the file should be, for the error.
         unused: keys of the file that the network has no place for; one that ends in a dot stands
             for all that begin with it.
+        constants: keys of the file, if they are there, whose values the network has built in.
         dtype: that the weights get, one for all or by their keys; the file may hold another
             floating one.
 
@@ -77,7 +80,12 @@ def load_weights(
     below = tuple(name for name in unused if name.endswith("."))
     for key in [key for key in tensors if key in unused or key.startswith(below)]:
         del tensors[key]
+    others = [] if constants is None else _pop_constants(tensors, constants)
     differences = find_differences(module.state_dict(), tensors)
+    if others:
+        differences = ", ".join(
+            [*filter(None, [differences]), _name_some(others, "of other values")]
+        )
     if differences:
         raise WeightsError(
             f"{file} is no {checkpoint.file}: {differences}; {checkpoint.advice} "
@@ -123,6 +131,19 @@ def find_differences(wanted: Mapping[str, Tensor], found: Mapping[str, Tensor]) 
         "not floating": integers,
     }
     return ", ".join(_name_some(keys, kind) for kind, keys in kinds.items() if keys)
+
+
+def _pop_constants(
+    tensors: dict[str, Tensor], constants: Mapping[str, Sequence[float]]
+) -> list[str]:
+    """Remove constants from a table and return the keys of those that differ."""
+    others = []
+    for key in constants.keys() & tensors.keys():
+        found, built_in = tensors.pop(key).flatten().double(), torch.tensor(constants[key]).double()
+        is_same = found.shape == built_in.shape and torch.allclose(found, built_in, rtol=ROUNDING)
+        if not is_same:
+            others.append(key)
+    return sorted(others)
 
 
 def _name_some(keys: Sequence[str], kind: str) -> str:
