@@ -70,6 +70,45 @@ def import_torch() -> Any:
     return torch
 
 
+@cache
+def import_laspy() -> Any:
+    """Import laspy, with the packages for LAZ and coordinate systems that belong to the extra.
+
+    Raises:
+        DependencyError: one of them is missing; says how to get it.
+    """
+    try:
+        import laspy  # noqa: PLC0415  (an extra)
+
+        for companion in ("lazrs", "pyproj"):
+            import_module(companion)
+    except ImportError as error:
+        raise DependencyError(
+            f"LAS and LAZ need laspy, lazrs and pyproj ({error}); "
+            "install them: pip install 'laser-slam[las]'"
+        ) from error
+    return laspy
+
+
+@cache
+def import_rerun() -> Any:
+    """Import rerun, which only the viewer needs and a plain installation lacks.
+
+    Raises:
+        DependencyError: rerun is missing, cannot be loaded or is too old; says how to get it.
+    """
+    try:
+        import rerun  # noqa: PLC0415  (slow, and only the viewer needs it)
+
+        _ = rerun.CoordinateFrame, rerun.RecordingStream.set_log_time_enabled
+    except (ImportError, OSError, AttributeError) as error:
+        raise DependencyError(
+            f"rerun cannot be loaded or is too old ({error}); install it: "
+            "pip install 'laser-slam[viewer]'"
+        ) from error
+    return rerun
+
+
 def _preload_libusb() -> None:
     try:
         import libusb_package  # noqa: PLC0415
