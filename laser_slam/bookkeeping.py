@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,6 +18,7 @@ from laser_slam.types import Frame
 
 Item = TypeVar("Item")
 Progress = Callable[[str, int, int | None], None]
+IDLE = ""  # in place of a stage: the thread waits
 logger = logging.getLogger(__name__)
 
 
@@ -36,6 +38,7 @@ def identify(dataset: Dataset) -> dict[str, Any]:
         "size": list(info.size),
         "num_frames": info.num_frames,
         "intrinsics": None if info.intrinsics is None else info.intrinsics.tolist(),
+        "intrinsics_source": info.intrinsics_source,
         "first_image_crc32": zlib.crc32(image),
     }
 
@@ -43,43 +46,63 @@ def identify(dataset: Dataset) -> dict[str, Any]:
 class FrameLog:
     """Remember of the frames that pass what the end of the run needs, and no image."""
 
-    def __init__(self) -> None:
-        self.times_s: list[float] = []
-        self.num_unreadable = 0
+    def __init__(self, times_s: Iterable[float] = (), unreadable: Iterable[int] = ()) -> None:
+        """Start with what passed before.
+
+        Args:
+            times_s: seconds of the frames.
+            unreadable: indices of those that could not be read.
+        """
+        self.times_s = [float(time_s) for time_s in times_s]
+        self.unreadable = [int(frame) for frame in unreadable]
 
     def note(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """Pass the frames on."""
         for frame in frames:
             self.times_s.append(frame.time_s)
             if frame.image is None:
-                self.num_unreadable += 1
+                self.unreadable.append(frame.index)
                 logger.warning("frame %d cannot be read", frame.index)
             yield frame
 
     def counts(self) -> dict[str, int]:
         """Return how many frames were read, and how many could not be."""
-        return {"read": len(self.times_s), "unreadable": self.num_unreadable}
+        return {"read": len(self.times_s), "unreadable": len(self.unreadable)}
 
 
 class StageClock:
-    """Charge wall and CPU seconds to the innermost stage that is under way."""
+    """Charge wall and CPU seconds to what is under way.
+
+    In each thread that is the innermost stage it is in; what several threads do at the same time
+    shares the seconds equally, so that all stages together are the whole.
+    """
 
     def __init__(self) -> None:
         self.wall_s: defaultdict[str, float] = defaultdict(float)
         self.cpu_s: defaultdict[str, float] = defaultdict(float)
-        self._stages = ["other"]
+        self._lock = threading.Lock()
+        self._stages: dict[int, list[str]] = {}  # by thread; IDLE: it waits for another
         self._mark = (time.perf_counter(), time.process_time())
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Charge what happens inside to ``name``, but for the stages inside it."""
-        self._charge()
-        self._stages.append(name)
+        thread = threading.get_ident()
+        with self._lock:
+            self._charge()
+            self._stages.setdefault(thread, []).append(name)
         try:
             yield
         finally:
-            self._charge()
-            self._stages.pop()
+            with self._lock:
+                self._charge()
+                self._stages[thread].pop()
+                if not self._stages[thread]:
+                    del self._stages[thread]
+
+    def idle(self) -> AbstractContextManager[None]:
+        """Charge nothing to this thread, which waits for another."""
+        return self.stage(IDLE)
 
     def timed(self, name: str, items: Iterable[Item]) -> Iterator[Item]:
         """Charge the making of the items to ``name``, but not their use."""
@@ -94,7 +117,8 @@ class StageClock:
 
     def report(self, num_frames: int) -> dict[str, Any]:
         """Return seconds by stage, in all, and frames per second of wall time."""
-        self._charge()
+        with self._lock:
+            self._charge()
         total = sum(self.wall_s.values())
         return {
             "seconds": {
@@ -108,8 +132,10 @@ class StageClock:
 
     def _charge(self) -> None:
         wall, cpu = time.perf_counter(), time.process_time()
-        self.wall_s[self._stages[-1]] += wall - self._mark[0]
-        self.cpu_s[self._stages[-1]] += cpu - self._mark[1]
+        busy = [stages[-1] for stages in self._stages.values() if stages[-1] != IDLE] or ["other"]
+        for stage in busy:
+            self.wall_s[stage] += (wall - self._mark[0]) / len(busy)
+            self.cpu_s[stage] += (cpu - self._mark[1]) / len(busy)
         self._mark = (wall, cpu)
 
 

@@ -5,21 +5,16 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Iterator
-from contextlib import closing
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.backbones import make_backbone
 from laser_slam.backbones.base import Backbone
 from laser_slam.bookkeeping import (
-    FrameLog,
     Progress,
     StageClock,
-    identify,
     no_progress,
     run_log,
 )
@@ -28,12 +23,7 @@ from laser_slam.closures import Tools, make_matcher
 from laser_slam.config import Config
 from laser_slam.datasets.base import Dataset
 from laser_slam.fusion import fuse
-from laser_slam.rectification import (
-    Rectifier,
-    load_calibration,
-    reduce_images,
-    save_calibration,
-)
+from laser_slam.predicting import make_source, settle
 from laser_slam.report import stages_picture
 from laser_slam.results import (
     Findings,
@@ -51,20 +41,15 @@ from laser_slam.results import (
 )
 from laser_slam.sim3 import interpolate_poses
 from laser_slam.slam import LoopCloser, Slam, StoredWindow, read_window
-from laser_slam.store import WindowFiles, link_latest, new_run_folder, open_run_folder
+from laser_slam.store import WindowFiles, link_latest, new_run_folder
 from laser_slam.types import (
-    NO_DISTORTION,
-    Calibration,
     Cloud,
     Image,
     Prediction,
     Submap,
     Trajectory,
-    Window,
 )
-from laser_slam.windows import cut_windows, select_keyframes
 
-COMPLETE = "windows/complete"  # the mark that every window of the input has its file
 logger = logging.getLogger(__name__)
 
 
@@ -75,7 +60,7 @@ class Pipeline:
 
     Attributes:
         folder: of the run.
-        backbone: the source of depth and poses.
+        source: of the predicted windows.
     """
 
     def __init__(
@@ -98,22 +83,15 @@ class Pipeline:
             on_progress: called with a stage's name, how much is done and of how much.
         """
         self._dataset = dataset
-        self._config = config
         self._info = dataset.info
-        self.backbone = backbone or make_backbone(config.backbone, self._info, dataset.true_depth)
+        self._config = config = settle(config, self._info, out)
         self._on_progress = on_progress
         self._clock = StageClock()
         self._slam = Slam(config, self._clock.stage)
-        self._size = self.backbone.image_size(self._info.size)
-        self._calibration = Calibration(
-            self._given(), NO_DISTORTION, self._size, self._info.intrinsics_source
-        )
-        self._rectifier = Rectifier(self._calibration, self._size)
-        self._input = FrameLog()
         self._intrinsics: list[NDArray[np.float64]] = []
         self._is_named_here = out is None
-        self._is_complete = False
         self.folder = Path(os.path.normpath(out)) if out else new_run_folder(self._info.name)
+        self.source = make_source(dataset, config, self.folder, backbone, self._clock, on_progress)
         self._files = WindowFiles(self.folder)
         self._closer = self._make_closer()
 
@@ -123,14 +101,12 @@ class Pipeline:
         Raises:
             LaserSlamError: the input, the settings or the folder cannot be used.
         """
-        self._open_folder()
+        self.source.open()
         with run_log(self.folder / "run.log") as warnings:
             with self._clock.stage("calibrate"):
-                self._calibrate()
-            for window in self._windows():
-                prediction, colors = self._predict(window)
+                self.source.calibrate()
+            for prediction, colors in self.source.windows():
                 self._place(prediction, colors)
-            (self.folder / COMPLETE).touch()
             if self._closer is not None:
                 with self._clock.stage("places"):
                     self._closer.finish()
@@ -147,76 +123,15 @@ class Pipeline:
             link_latest(self.folder)
         return Results(self.folder, trajectory, cloud, report)
 
-    def _open_folder(self) -> None:
-        sequence = identify(self._dataset)
-        is_resumed = open_run_folder(self.folder, self._config, sequence)
-        self._is_complete = (self.folder / COMPLETE).exists()
-        if is_resumed:
-            logger.info("resuming the run in %s", self.folder)
-
-    def _calibrate(self) -> None:
-        """Learn how the camera projects, from the first keyframes; rectify images by it."""
-        path = self.folder / "calibration.yaml"
-        if path.exists():
-            self._calibration = load_calibration(path)
-        elif self._config.calibration.keyframes:
-            self._calibration = self.backbone.calibrate(self._first_windows(), self._given())
-            save_calibration(path, self._calibration)
-        self._rectifier = Rectifier(self._calibration, self._size)
-        logger.info("calibration: %s", self._calibration.source)
-        if self._calibration.warning:
-            logger.warning("calibration: %s", self._calibration.warning)
-
     def _make_closer(self) -> LoopCloser | None:
         if not self._config.closures.enabled:
             return None
-        tools = Tools(make_matcher(self._config.places.verification), self.backbone)
+        tools = Tools(make_matcher(self._config.places.verification), self.source.backbone)
         return LoopCloser(self._config, self._slam, self._files, tools)
 
-    def _first_windows(self) -> Iterator[Window]:
-        """Cut windows from the first keyframes, as the camera sees them."""
-        info, config = self._info, self._config.windows
-        with closing(self._dataset.frames()) as frames:
-            keyframes = select_keyframes(frames, config, info.intrinsics, info.size)
-            first = islice(keyframes, self._config.calibration.keyframes)
-            as_seen = Calibration(None, NO_DISTORTION, self._size, "")
-            for window in cut_windows(first, config, Rectifier(as_seen, self._size).image):
-                yield window
-                self._on_progress("calibrating", int(window.frames[-1]) + 1, None)
-
-    def _given(self) -> NDArray[np.float64] | None:
-        """Return the intrinsics that came with the data set, in pixels of the backbone's images."""
-        given = self._info.intrinsics
-        return None if given is None else resize_intrinsics(given, self._info.size, self._size)
-
-    def _windows(self) -> Iterator[Window]:
-        """Read the frames, choose keyframes, cut windows: lazily, one window at a time."""
-        info, config, clock = self._info, self._config.windows, self._clock
-        frames = clock.timed("read", self._input.note(self._dataset.frames()))
-        keyframes = clock.timed(
-            "keyframes", select_keyframes(frames, config, info.intrinsics, info.size)
-        )
-        return clock.timed("windows", cut_windows(keyframes, config, self._rectifier.image))
-
-    def _predict(self, window: Window) -> tuple[Prediction, Image]:
-        """Ask the backbone, or read what it said of this window before the run was broken off."""
-        is_usable = self._is_complete or not self.backbone.remembers
-        if is_usable and self._files.has(window.index):
-            with self._clock.stage("load"):
-                prediction, colors = self._files.load(window.index, window.frames)
-        else:
-            with self._clock.stage("predict"):
-                prediction = self.backbone.predict(
-                    window.images, window.frames, self._rectifier.intrinsics
-                )
-            with self._clock.stage("store"):
-                colors = reduce_images(window.images, prediction.depth.shape[1:])
-                prediction, colors = self._files.save(window.index, prediction, colors)
-        for warning in prediction.warnings:
-            logger.warning("window %d: %s", window.index, warning)
-        return prediction, colors
-
     def _place(self, prediction: Prediction, colors: Image) -> None:
+        for warning in prediction.warnings:
+            logger.warning("window %d: %s", len(self._slam.nodes), warning)
         submap = self._slam.add(prediction, colors)
         if self._slam.layers is not None:
             with self._clock.stage("store"):
@@ -226,11 +141,11 @@ class Pipeline:
                 self._closer.add(submap.prediction, colors)
         size = (prediction.depth.shape[1], prediction.depth.shape[2])
         self._intrinsics.append(resize_intrinsics(prediction.intrinsics[0], size, self._info.size))
-        self._on_progress("mapping", len(self._input.times_s), self._info.num_frames)
+        self._on_progress("mapping", int(prediction.frames[-1]) + 1, self._info.num_frames)
 
     def _trajectory(self, *, closed: bool = True) -> Trajectory:
         """Give every frame of the input a pose, those between keyframes by interpolation."""
-        times_s = np.array(self._input.times_s)
+        times_s = np.array(self.source.input.times_s)
         with self._clock.stage("trajectory"):
             key = self._slam.trajectory(times_s, closed=closed)
             world_from_cam = interpolate_poses(times_s, key.times_s, key.world_from_cam)
@@ -264,7 +179,7 @@ class Pipeline:
 
     def _true_depth(self, frame: int) -> NDArray[np.float32] | None:
         truth = self._dataset.true_depth(frame)
-        return None if truth is None else self._rectifier.depth(truth)
+        return None if truth is None else self.source.rectifier.depth(truth)
 
     def _write(self, found: Findings) -> None:
         with self._clock.stage("write"):
@@ -276,8 +191,8 @@ class Pipeline:
     def _report(self, found: Findings, warnings: list[str]) -> dict[str, Any]:
         scores, cloud = found.scores, found.cloud
         return {
-            "sequence": describe_sequence(self._info, self._calibration, self._intrinsics),
-            "frames": {**self._input.counts(), "keyframes": self._slam.num_keyframes},
+            "sequence": describe_sequence(self._info, self.source.calibration, self._intrinsics),
+            "frames": {**self.source.input.counts(), "keyframes": self._slam.num_keyframes},
             "windows": {"num": len(self._slam.nodes), "bridged": self._slam.bridged},
             "trajectory": scores.trajectory.numbers() if scores.trajectory else None,
             "depth": scores.depth,
@@ -286,7 +201,7 @@ class Pipeline:
             "closures": describe_loops(found.loops),
             "map": {"num_points": len(cloud.points), "voxel_size": cloud.voxel_size},
             "warnings": warnings,
-            **self._clock.report(len(self._input.times_s)),
+            **self._clock.report(len(self.source.input.times_s)),
             **describe_system(),
             "settings": self._config.model_dump(mode="json"),
         }

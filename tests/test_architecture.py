@@ -18,7 +18,7 @@ STAGES = [
     "evaluation",
 ]
 STAGES += ["viewer", "report", "layers", "places", "pose_graph"]
-COMPOSITION = ["closures", "slam", "bookkeeping", "results", "rescoring", "pipeline"]
+COMPOSITION = ["closures", "slam", "bookkeeping", "results", "rescoring", "predicting", "pipeline"]
 COMPOSITION += ["console", "cli"]
 TORCH = {"torch", "safetensors"}  # no dependencies of a plain installation
 HEAVY = {"open3d", *TORCH, "gtsam", "numba", "cv2", "matplotlib", "scipy"}

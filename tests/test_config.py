@@ -102,7 +102,7 @@ def test_every_setting_is_described() -> None:
         ("windows.sise=30", "windows.sise: no such setting (did you mean windows.size?)"),
         ("windos.size=30", "windos.size: no such setting (did you mean windows.size?)"),
         ("size=30", "size: no such setting (did you mean windows.size?)"),
-        ("windows.size=2", "windows.size: input should be greater than or equal to 3, got 2"),
+        ("windows.size=2", "windows: size (2) must be 3 or more, or auto"),
         (
             "windows.overlap=25",
             "windows: overlap (25) must be smaller than size (20): "

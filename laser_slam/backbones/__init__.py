@@ -19,6 +19,7 @@ BACKBONES = {
     "classical": "laser_slam.backbones.classical:ClassicalBackbone",
     "simulated": "laser_slam.backbones.simulated:SimulatedBackbone",
 }
+WINDOW_SIZE = 20  # keyframes, where memory is no limit
 FROM_TRUTH = {"simulated"}  # these are made from what the data set knows, too
 
 
@@ -41,3 +42,14 @@ def make_backbone(
     truth = (info, true_depth) if config.name in FROM_TRUTH else ()
     backbone: Backbone = chosen(config, *truth)
     return backbone
+
+
+def choose_window_size(config: BackboneConfig, size: tuple[int, int], overlap: int) -> int:
+    """Choose how many keyframes a window has.
+
+    Args:
+        config: of the backbone.
+        size: (height, width) of the data set's images.
+        overlap: keyframes that neighbouring windows share.
+    """
+    return max(overlap + 3, WINDOW_SIZE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -56,19 +56,21 @@ class RunOptions:
     out: OutOption = None
     quiet: QuietOption = False
 
-    def settings(self) -> Config:
-        """Resolve the settings."""
+    def settings(self, base: Mapping[str, Any] | None = None) -> Config:
+        """Resolve the settings, over those of the code or another base."""
         assignments = list(self.set or [])
         if self.backbone is not None:
             assignments.append(f"backbone.name={json.dumps(self.backbone)}")
-        return resolve(self.config, assignments)
+        return resolve(self.config, assignments, base)
 
     def work(self, dataset: Dataset, config: Config) -> None:
         """Do what the command is for."""
         raise NotImplementedError
 
 
-def resolve(file: str | None, assignments: list[str]) -> Config:
+def resolve(
+    file: str | None, assignments: list[str], base: Mapping[str, Any] | None = None
+) -> Config:
     """Layer the settings: a file, or a shipped one by its name, and assignments."""
     from laser_slam.config import load_config, shipped_configs
 
@@ -76,7 +78,7 @@ def resolve(file: str | None, assignments: list[str]) -> Config:
     if path is not None and not path.exists():
         shipped = shipped_configs() / f"{file}.yaml"
         path = shipped if shipped.exists() else path
-    return load_config(None, path, assignments)
+    return load_config(None, path, assignments, base)
 
 
 def command(

@@ -1,4 +1,4 @@
-"""What is done with a data set: map it."""
+"""What is done with a data set: map it, or only predict its windows."""
 
 from __future__ import annotations
 
@@ -7,13 +7,19 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from laser_slam.cli.app import INTERRUPTED, RunOptions
+from laser_slam.cli.app import HELP_NAMES, INTERRUPTED, RunOptions
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from laser_slam.config import Config
     from laser_slam.datasets.base import Dataset
+
+predict_app = typer.Typer(
+    help="Predict the windows of a data set only; map them later, anywhere, with 'replay'.",
+    no_args_is_help=True,
+    context_settings=HELP_NAMES,
+)
 
 
 @dataclass(frozen=True)
@@ -30,10 +36,29 @@ class MapOptions(RunOptions):
             try:
                 results = pipeline.run()
             except KeyboardInterrupt as error:
-                text = _how_to_go_on(pipeline.folder, remembers=pipeline.backbone.remembers)
+                text = _how_to_go_on(pipeline.folder, remembers=pipeline.source.remembers)
                 typer.echo(text, err=True)
                 raise typer.Exit(INTERRUPTED) from error
         print_summary(results.report, results.folder)
+
+
+@dataclass(frozen=True)
+class PredictOptions(RunOptions):
+    """Options of predicting alone."""
+
+    def work(self, dataset: Dataset, config: Config) -> None:
+        """Predict the windows of the data set."""
+        from laser_slam.console import progress_display
+        from laser_slam.predicting import Job
+
+        with progress_display(quiet=self.quiet) as on_progress:
+            job = Job(dataset, config, self.out, on_progress=on_progress)
+            try:
+                num = job.run()
+            except KeyboardInterrupt as error:
+                typer.echo(_how_to_go_on(job.folder, remembers=job.source.remembers), err=True)
+                raise typer.Exit(INTERRUPTED) from error
+        typer.echo(f"{num} windows predicted; map them with: laser-slam replay {job.folder}")
 
 
 def _how_to_go_on(folder: Path, *, remembers: bool) -> str:

@@ -1,4 +1,4 @@
-"""The commands that open a data set: each maps it."""
+"""The commands that open a data set: each maps it, and each can predict its windows only."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from laser_slam.cli.app import RunOptions, command
-from laser_slam.cli.jobs import MapOptions
+from laser_slam.cli.app import RunOptions, app, command
+from laser_slam.cli.jobs import MapOptions, PredictOptions, predict_app
 from laser_slam.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -26,8 +26,9 @@ FovOption = Annotated[
 
 
 def source(function: Callable[..., None], name: str | None = None) -> Callable[..., None]:
-    """Make a function that opens a data set a command that maps it."""
+    """Make a function that opens a data set two commands: to map it, and to predict its windows."""
     command(function, name, options=MapOptions, verb="Map")
+    command(function, name, group=predict_app, options=PredictOptions, verb="Predict")
     return function
 
 
@@ -112,6 +113,25 @@ def video(
     config = options.settings()
     dataset = VideoFile(file, _parse_intrinsics(intrinsics), fov, config.dataset.stride)
     options.work(dataset, config)
+
+
+def replay(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="What 'predict' wrote, or a run's folder.")
+    ],
+    options: MapOptions,
+) -> None:
+    """A sequence from its predictions alone: no images, no backbone; with other settings."""
+    from laser_slam.predicting.sequence import PredictedSequence
+
+    sequence = PredictedSequence(folder)
+    if options.backbone is not None:
+        raise ConfigError(f"--backbone {options.backbone}: these windows are predicted already")
+    options.work(sequence, options.settings(sequence.settings))
+
+
+command(replay, options=MapOptions, verb="Map")
+app.add_typer(predict_app, name="predict")
 
 
 def _parse_intrinsics(text: str | None) -> NDArray[np.float64] | None:

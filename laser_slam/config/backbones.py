@@ -29,6 +29,7 @@ class ReplayConfig(Section):
     """Predictions that were made before, perhaps elsewhere."""
 
     folder: str = Field("", description="what 'laser-slam predict' wrote, or the folder of a run")
+    made_by: str = Field("", description="the backbone that predicted; the run looks it up")
 
 
 class BackboneConfig(Section):
@@ -41,3 +42,8 @@ class BackboneConfig(Section):
     pi3x: Pi3XConfig = Pi3XConfig()
     vggt: NetworkConfig = NetworkConfig()
     replay: ReplayConfig = ReplayConfig()
+
+    @property
+    def origin(self) -> str:
+        """Return the name of the backbone that predicts, or did."""
+        return self.replay.made_by if self.name == "replay" else self.name

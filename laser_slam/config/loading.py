@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,10 @@ from laser_slam.errors import ConfigError
 
 
 def load_config(
-    name: str | None = None, file: Path | None = None, assignments: Sequence[str] = ()
+    name: str | None = None,
+    file: Path | None = None,
+    assignments: Sequence[str] = (),
+    base: Mapping[str, Any] | None = None,
 ) -> Config:
     """Layer the settings: code < ``configs/<name>.yaml`` < ``file`` < ``key=value`` assignments.
 
@@ -23,6 +27,7 @@ def load_config(
         name: of a settings file that ships with laser-slam, such as ``kitti``.
         file: a settings file of the user's.
         assignments: ``section.key=value``, the value in YAML.
+        base: nested settings in the place of the code's own; None: these.
 
     Raises:
         ConfigError: a file is missing or no YAML, a setting is unknown or out of its limits.
@@ -30,7 +35,7 @@ def load_config(
     >>> load_config(assignments=["windows.size=30"]).windows.size
     30
     """
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = copy.deepcopy(dict(base or {}))
     if name is not None:
         _merge(settings, _read_shipped(name))
     if file is not None:

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from laser_slam.config.backbones import BackboneConfig
 from laser_slam.config.closures import ClosuresConfig
+from laser_slam.config.export import ExportConfig
 from laser_slam.config.fusion import FusionConfig
 from laser_slam.config.layers import LayersConfig
 from laser_slam.config.places import PlacesConfig
 from laser_slam.config.section import Section as _Section
+
+MIN_WINDOW = 3  # keyframes
+
+
+def _zero_if_auto(value: object) -> object:
+    return 0 if value == "auto" else value
 
 
 class DatasetConfig(_Section):
@@ -24,7 +31,9 @@ class DatasetConfig(_Section):
 class WindowsConfig(_Section):
     """Keyframes and overlapping windows."""
 
-    size: int = Field(20, ge=3, description="keyframes per window")
+    size: Annotated[int, BeforeValidator(_zero_if_auto)] = Field(
+        20, ge=0, description="keyframes per window, 3 or more; auto: what memory allows"
+    )
     overlap: int = Field(5, ge=1, description="keyframes shared by neighbouring windows")
     min_parallax_px: float = Field(
         1.5, ge=0, description="motion that makes a keyframe, rotation removed; px at 640 wide"
@@ -35,7 +44,9 @@ class WindowsConfig(_Section):
 
     @model_validator(mode="after")
     def _overlap_leaves_new_frames(self) -> Self:
-        if self.overlap >= self.size:
+        if 0 < self.size < MIN_WINDOW:
+            raise ValueError(f"size ({self.size}) must be {MIN_WINDOW} or more, or auto")
+        if self.size and self.overlap >= self.size:
             raise ValueError(
                 f"overlap ({self.overlap}) must be smaller than size ({self.size}): "
                 "lower windows.overlap or raise windows.size"
@@ -125,6 +136,7 @@ class Config(_Section):
     closures: ClosuresConfig = ClosuresConfig()
     pose_graph: PoseGraphConfig = PoseGraphConfig()
     fusion: FusionConfig = FusionConfig()
+    export: ExportConfig = ExportConfig()
     synthetic: SyntheticConfig = SyntheticConfig()
     run: RunConfig = RunConfig()
 
@@ -132,7 +144,7 @@ class Config(_Section):
     def has_layers(self) -> bool:
         """Tell whether layers are aligned: auto means for every backbone but ``classical``."""
         if self.layers.enabled == "auto":
-            return self.backbone.name != "classical"
+            return self.backbone.origin != "classical"
         return self.layers.enabled == "always"
 
     @property

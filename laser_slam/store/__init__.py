@@ -1,7 +1,12 @@
 """Files of the run folder."""
 
 from laser_slam.store.files import atomic_write, write_text
-from laser_slam.store.run import link_latest, new_run_folder, open_run_folder
+from laser_slam.store.run import (
+    link_latest,
+    name_differences,
+    new_run_folder,
+    open_run_folder,
+)
 from laser_slam.store.tiles import Tile, TileEntry, TileFiles, TileIndex
 from laser_slam.store.windows import (
     FORMAT_VERSION,
@@ -23,6 +28,7 @@ __all__ = [
     "link_latest",
     "load_layers",
     "load_prediction",
+    "name_differences",
     "new_run_folder",
     "open_run_folder",
     "save_layers",

@@ -98,19 +98,24 @@ def _refuse_difference(path: Path, wanted: dict[str, Any], what: str) -> None:
         stored = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise RunFolderError(f"cannot read {path}; remove {path.parent} and run again") from error
-    old, new = dict(_flatten(stored)), dict(_flatten(wanted))
-    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
-    if keys:
-        listed = ", ".join(f"{key} ({old.get(key)}, now {new.get(key)})" for key in keys[:5])
-        more = f" and {len(keys) - 5} more" if len(keys) > 5 else ""
+    differences = name_differences(stored, wanted)
+    if differences:
         raise RunFolderError(
-            f"{path.parent} holds a run with other {what}: {listed}{more}; "
+            f"{path.parent} holds a run with other {what}: {differences}; "
             "choose another folder with --out"
         )
 
 
+def name_differences(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    """Name the keys in which two nested tables differ, with both values; empty: in none."""
+    old, new = dict(_flatten(stored)), dict(_flatten(wanted))
+    keys = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+    listed = ", ".join(f"{key} ({old.get(key)}, now {new.get(key)})" for key in keys[:5])
+    return listed + (f" and {len(keys) - 5} more" if len(keys) > 5 else "")
+
+
 def _flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    if not isinstance(settings, dict):
+    if not isinstance(settings, Mapping):
         yield prefix, settings
         return
     for key, value in settings.items():

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import os
+import shutil
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -110,6 +112,19 @@ class WindowFiles:
     def save(self, index: int, prediction: Prediction, colors: Image) -> tuple[Prediction, Image]:
         """Write a window; see ``save_prediction``."""
         return save_prediction(self._path("windows", index), prediction, colors)
+
+    def adopt(self, index: int, other: WindowFiles) -> None:
+        """Take a window's file from another folder: by a link where that can be, else a copy.
+
+        Raises:
+            RunFolderError: the system could not write.
+        """
+        ours, theirs = self._path("windows", index), other._path("windows", index)
+        with atomic_write(ours) as partial:
+            try:
+                os.link(theirs, partial)
+            except OSError:
+                shutil.copyfile(theirs, partial)
 
     def load(self, index: int, frames: NDArray[np.int64] | None = None) -> tuple[Prediction, Image]:
         """Read a window back; see ``load_prediction``.
