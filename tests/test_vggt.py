@@ -69,6 +69,7 @@ def assert_same(found: VggtOutput, expected: VggtOutput, tolerance: float = 1e-5
     """Compare all that two predictions say, relative to the largest magnitude."""
     for name, ours, theirs in zip(found._fields, found, expected, strict=True):
         assert ours is not None, name
+        assert theirs is not None, name
         assert golden.relative_difference(ours, theirs.numpy()) < tolerance, name
 
 

@@ -26,10 +26,10 @@ NUM_SPECIAL = 1 + NUM_REGISTERS  # tokens of a frame before its patches; the cam
 RELEASED = Checkpoint(
     setting="backbone.vggt.weights",
     file="model.safetensors",
-    url="https://huggingface.co/facebook/VGGT-1B (for commercial use, after registration: "
-    "vggt_1B_commercial.pt of facebook/VGGT-1B-Commercial)",
+    url="https://huggingface.co/facebook/VGGT-1B",
     size="5.03 GB",
-    licence="CC BY-NC 4.0, non-commercial",
+    licence="CC BY-NC 4.0; for commercial use, once Meta grants access: vggt_1B_commercial.pt of "
+    "facebook/VGGT-1B-Commercial",
     repo="facebook/VGGT-1B",
 )
 RELEASED_DENSE = DptConfig()
@@ -70,7 +70,8 @@ class VggtOutput(NamedTuple):
         depth: (B, N, H, W) z along the optical axis, > 0.
         depth_confidence: (B, N, H, W), >= 1 without limit.
         cam_from_world: (B, N, 4, 4) rigid, camera axes x right, y down, z forward.
-        intrinsics: (B, N, 3, 3), px; the principal point is (W/2, H/2).
+        intrinsics: (B, N, 3, 3), px; the principal point is (W/2, H/2). Infinite focal lengths
+            where it sees no angle of view.
         tokens: (B, N, D) mean of the encoder's patch tokens, which tells places apart.
         points: (B, N, H, W, 3) in the world; None without ``point_head``.
         points_confidence: (B, N, H, W), >= 1; None without ``point_head``.
