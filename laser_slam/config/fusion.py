@@ -27,3 +27,14 @@ class FusionConfig(Section):
     min_observations: int = Field(
         8, ge=1, description="views that a voxel and its 26 neighbours need in sum; fewer: noise"
     )
+    tile_bits: int = Field(
+        8, ge=3, le=12, description="the map is made in cubes of 2^tile_bits voxels"
+    )
+    active_voxels: int = Field(
+        3_000_000,
+        ge=1,
+        description="voxels in memory beyond which cubes go to disk (90 bytes each)",
+    )
+    cloud_points: int = Field(
+        10_000_000, ge=1, description="points that pictures and Python users get at most"
+    )

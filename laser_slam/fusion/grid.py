@@ -1,220 +1,262 @@
-"""A growing hash table of voxels that average position and colour."""
+"""Voxels that average position, colour and normal; they grow as frames come in."""
 
 from __future__ import annotations
 
-import logging
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from laser_slam.types import Cloud
+from laser_slam.fusion.keys import Keys, key_at, tile_at, tiles_of
+from laser_slam.fusion.table import Slots, empty_slots, index_rows, row_of
+from laser_slam.fusion.views import View, surface_normal
 
-Array = NDArray[np.float64]
-
-_LOGGER = logging.getLogger(__name__)
-_BITS = 21  # of a voxel's index per axis: three fit into one int64
-_HALF = 1 << (_BITS - 1)
-_MASK = (1 << _BITS) - 1
 _FIRST_VOXELS = 1 << 16
-_PORTION = 1 << 20  # voxels that are turned into points at once
-_MAX_LOAD = 0.6  # of the table of slots: beyond it, open addressing gets slow
+_NUM_SUMS = 10
 
 
-class View(NamedTuple):
-    """One frame as the kernel wants it.
+class Voxels(NamedTuple):
+    """Voxels in the order of first sight.
 
     Attributes:
-        depth: (H, W) in window units.
-        weight: (H, W) confidence; 0: stays out.
-        color: (H, W, 3) RGB.
-        world_from_ray: (3, 3) maps (u, v, 1) times depth to world axes and units.
-        center: (3,) the camera in world units.
+        keys: (M,) packed voxel.
+        sums: (M, 10) weight; weight times position in the voxel (0..1 per axis), times RGB, times
+            unit normal.
+        views: (M,) frames that saw the voxel.
     """
 
-    depth: NDArray[np.float32]
-    weight: NDArray[np.float32]
-    color: NDArray[np.uint8]
-    world_from_ray: Array
-    center: Array
+    keys: Keys
+    sums: NDArray[np.float32]
+    views: NDArray[np.int32]
 
 
-class _Voxels(NamedTuple):
-    """The table: ``slots`` finds a voxel's row in the other arrays.
+class _Table(NamedTuple):
+    """Voxels with room for more: ``slots`` finds a voxel's row in the other arrays.
 
     Attributes:
         slots: (2^k,) row of a voxel, or -1.
-        keys: (M,) packed voxel index.
-        sums: (M, 7) weight; weight times position in the voxel (0..1 per axis), times RGB.
+        keys: (M,) as in ``Voxels``.
+        sums: (M, 10) as in ``Voxels``.
         seen: (M, 2) frames that saw the voxel; number of the last of them.
     """
 
-    slots: NDArray[np.int32]
-    keys: NDArray[np.int64]
+    slots: Slots
+    keys: Keys
     sums: NDArray[np.float32]
     seen: NDArray[np.int32]
 
 
+class Located(NamedTuple):
+    """Where the pixels of one frame lie.
+
+    Attributes:
+        pixels: (N,) flat index of each pixel that counts.
+        keys: (N,) packed voxel.
+        inside: (N, 3) position in the voxel, 0..1.
+        ordinals: (N,) row of its tile in ``tiles``.
+        tiles: (T,) packed tiles that the frame touches.
+        num_outside: points that no index reaches.
+    """
+
+    pixels: NDArray[np.int32]
+    keys: Keys
+    inside: NDArray[np.float32]
+    ordinals: NDArray[np.int32]
+    tiles: Keys
+    num_outside: int
+
+
 class VoxelGrid:
-    """Voxels that grow as frames come in.
+    """Voxels that come with the frames, and go and come back tile by tile.
 
     Rows are in the order of first sight, so that neighbouring pixels find neighbouring memory.
     Positions are summed relative to their voxel: float32 loses nothing far from the origin.
+
+    Args:
+        voxel_size: edge of a voxel in world units.
+        tile_bits: a tile is a cube of 2^tile_bits voxels.
     """
 
-    def __init__(self, voxel_size: float) -> None:
+    def __init__(self, voxel_size: float, tile_bits: int) -> None:
         self.voxel_size = voxel_size
+        self.tile_bits = tile_bits
         self.num_voxels = 0
-        self.num_frames = 0
-        self.num_outside = 0
-        self.voxels = _allocate(_FIRST_VOXELS)
+        self._num_frames = 0
+        self._table = _allocate(_FIRST_VOXELS)
 
-    def add(self, view: View, stride: int = 1) -> None:
-        """Average every ``stride``-th row and column of one frame into the grid."""
-        needed = self.num_voxels + int(np.count_nonzero(view.weight[::stride, ::stride]))
-        if needed > len(self.voxels.keys):
-            self._grow(needed)
-        self.num_frames += 1
-        state = (self.num_voxels, self.num_frames)
-        self.num_voxels, outside = _integrate(
-            view, self.voxels, state, 1.0 / self.voxel_size, stride
+    @property
+    def num_reserved(self) -> int:
+        """Return for how many voxels there is memory."""
+        return len(self._table.keys)
+
+    def locate(self, view: View, stride: int = 1) -> Located:
+        """Find voxel and tile of every ``stride``-th row's and column's pixels."""
+        num = view.weight[::stride, ::stride].size
+        out = Located(
+            np.empty(num, np.int32),
+            np.empty(num, np.int64),
+            np.empty((num, 3), np.float32),
+            np.empty(num, np.int32),
+            np.empty(num, np.int64),
+            0,
         )
-        self.num_outside += outside
+        num, num_tiles, outside = _locate(view, out, 1 / self.voxel_size, stride, self.tile_bits)
+        return Located(
+            out.pixels[:num],
+            out.keys[:num],
+            out.inside[:num],
+            out.ordinals[:num],
+            out.tiles[:num_tiles],
+            outside,
+        )
 
-    def _grow(self, needed: int) -> None:
-        old, num = self.voxels, self.num_voxels
-        self.voxels = _allocate(max(needed, num + num // 2))
-        self.voxels.keys[:num] = old.keys[:num]
-        self.voxels.sums[:num] = old.sums[:num]
-        self.voxels.seen[:num] = old.seen[:num]
-        _index(self.voxels.slots, self.voxels.keys, num)
+    def add(self, view: View, located: Located, is_wanted: NDArray[np.bool_]) -> None:
+        """Average the pixels of one frame that lie in wanted tiles.
 
-    def cloud(self, min_observations: int) -> Cloud:
-        """Return the averages of all voxels with enough support."""
-        if self.num_outside:
-            _LOGGER.warning(
-                "%d points lie more than %d voxels from the origin and stay out of the cloud; "
-                "raise fusion.voxel_size",
-                self.num_outside,
-                _HALF,
-            )
-        kept = np.flatnonzero(_supported(self.voxels, self.num_voxels, min_observations))
-        points, colors = np.empty((len(kept), 3)), np.empty((len(kept), 3), np.uint8)
-        for start in range(0, len(kept), _PORTION):  # the map is large enough without copies of it
-            part = slice(start, start + _PORTION)
-            keys, sums = self.voxels.keys[kept[part]], self.voxels.sums[kept[part]]
-            means = sums[:, 1:] / sums[:, :1]
-            for axis, shift in enumerate((2 * _BITS, _BITS, 0)):
-                corner = (keys >> shift & _MASK) - _HALF
-                points[part, axis] = (corner + means[:, axis]) * self.voxel_size
-            colors[part] = np.rint(means[:, 3:]).clip(0, 255)
-        return Cloud(points, colors, self.voxels.sums[kept, 0], self.voxel_size)
+        Args:
+            view: the frame.
+            located: where its pixels lie.
+            is_wanted: (T,) of the tiles of ``located``.
+        """
+        self._reserve(len(located.pixels))
+        self._num_frames += 1
+        state = (self.num_voxels, self._num_frames)
+        self.num_voxels = _integrate(view, located, is_wanted, self._table, state)
+
+    def put(self, voxels: Voxels) -> None:
+        """Take voxels back that were taken out; none of them may be here."""
+        self._reserve(len(voxels.keys))
+        start, stop = self.num_voxels, self.num_voxels + len(voxels.keys)
+        self._table.keys[start:stop] = voxels.keys
+        self._table.sums[start:stop] = voxels.sums
+        self._table.seen[start:stop, 0] = voxels.views
+        self._table.seen[start:stop, 1] = 0
+        index_rows(self._table.slots, self._table.keys, start, stop)
+        self.num_voxels = stop
+
+    def take(self, tiles: Keys) -> list[Voxels]:
+        """Take the voxels of some tiles out, tile by tile.
+
+        Args:
+            tiles: (T,) packed, rising.
+        """
+        num, table = self.num_voxels, self._table
+        owners = tiles_of(table.keys[:num], self.tile_bits)
+        found = np.minimum(np.searchsorted(tiles, owners), len(tiles) - 1)
+        is_taken = tiles[found] == owners
+        taken = np.flatnonzero(is_taken)
+        taken = taken[np.argsort(found[taken], kind="stable")]
+        ends = np.cumsum(np.bincount(found[is_taken], minlength=len(tiles)))
+        parts = [
+            Voxels(table.keys[rows], table.sums[rows], table.seen[rows, 0])
+            for rows in np.split(taken, ends[:-1])
+        ]
+        self._keep(np.flatnonzero(~is_taken))
+        return parts
+
+    def counts(self) -> dict[int, int]:
+        """Tell how many voxels each tile has here."""
+        owners = tiles_of(self._table.keys[: self.num_voxels], self.tile_bits)
+        tiles, counts = np.unique(owners, return_counts=True)
+        return dict(zip(tiles.tolist(), counts.tolist(), strict=True))
+
+    def _reserve(self, num: int) -> None:
+        needed, num_voxels = self.num_voxels + num, self.num_voxels
+        if needed <= len(self._table.keys):
+            return
+        old = self._table
+        self._table = _allocate(max(needed, num_voxels + num_voxels // 2))
+        self._table.keys[:num_voxels] = old.keys[:num_voxels]
+        self._table.sums[:num_voxels] = old.sums[:num_voxels]
+        self._table.seen[:num_voxels] = old.seen[:num_voxels]
+        index_rows(self._table.slots, self._table.keys, 0, num_voxels)
+
+    def _keep(self, rows: NDArray[np.int64]) -> None:
+        """Forget all other rows; free the memory if few are left."""
+        old = self._table
+        self._table = _allocate(max(len(rows), _FIRST_VOXELS))
+        self._table.keys[: len(rows)] = old.keys[rows]
+        self._table.sums[: len(rows)] = old.sums[rows]
+        self._table.seen[: len(rows)] = old.seen[rows]
+        index_rows(self._table.slots, self._table.keys, 0, len(rows))
+        self.num_voxels = len(rows)
 
 
-def _allocate(num_voxels: int) -> _Voxels:
-    num_slots = 1 << int(np.ceil(np.log2(num_voxels / _MAX_LOAD)))
-    return _Voxels(
-        slots=np.full(num_slots, -1, np.int32),
+def _allocate(num_voxels: int) -> _Table:
+    return _Table(
+        slots=empty_slots(num_voxels),
         keys=np.empty(num_voxels, np.int64),
-        sums=np.zeros((num_voxels, 7), np.float32),
+        sums=np.zeros((num_voxels, _NUM_SUMS), np.float32),
         seen=np.zeros((num_voxels, 2), np.int32),
     )
 
 
 @njit(cache=True, nogil=True)
-def _integrate(view: Any, voxels: Any, state: Any, per_voxel: float, stride: int) -> Any:
-    """Add the pixels of one frame; return the number of voxels and of points out of reach."""
-    num_voxels, frame = state
+def _locate(view: Any, out: Any, per_voxel: float, stride: int, tile_bits: int) -> Any:
+    """Fill ``out``; return the number of pixels, of tiles, and of points out of reach."""
     height, width = view.depth.shape
     position = np.empty(3)
-    outside, last_key, row = 0, np.int64(-1), 0
+    num, num_tiles, ordinal, outside, last_key = 0, 0, 0, 0, np.int64(-1)
     for v in range(0, height, stride):
         for u in range(0, width, stride):
-            weight = view.weight[v, u]
-            if not weight > 0:
+            if not view.weight[v, u] > 0:
                 continue
             for k in range(3):
                 ray = view.world_from_ray[k]
                 along = ray[0] * u + ray[1] * v + ray[2]
                 position[k] = (along * view.depth[v, u] + view.center[k]) * per_voxel
-            key = _key(position)
+            key = key_at(position)
             if key < 0:
                 outside += 1
                 continue
             if key != last_key:
-                row = _row(key, voxels.slots, voxels.keys, num_voxels)
-                num_voxels = max(num_voxels, row + 1)
+                ordinal, num_tiles = _ordinal(
+                    tile_at(key, tile_bits), out.tiles, ordinal, num_tiles
+                )
                 last_key = key
-            _accumulate(voxels, row, weight, position, view.color[v, u])
-            voxels.seen[row, 0] += voxels.seen[row, 1] != frame
-            voxels.seen[row, 1] = frame
-    return num_voxels, outside
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _accumulate(voxels: Any, row: int, weight: float, position: Any, color: Any) -> None:
-    sums = voxels.sums[row]
-    sums[0] += weight
-    for k in range(3):
-        sums[1 + k] += weight * np.float32(position[k] - np.floor(position[k]))
-        sums[4 + k] += weight * np.float32(color[k])
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _key(position: Any) -> Any:
-    """Pack the voxel that holds ``position`` (in voxels); -1: too far from the origin."""
-    key = np.int64(0)
-    for k in range(3):
-        index = np.int64(np.floor(position[k])) + _HALF
-        if index < 0 or index > _MASK:
-            return np.int64(-1)
-        key = (key << _BITS) | index
-    return key
+            out.pixels[num] = v * width + u
+            out.keys[num] = key
+            out.ordinals[num] = ordinal
+            for k in range(3):
+                out.inside[num, k] = position[k] - np.floor(position[k])
+            num += 1
+    return num, num_tiles, outside
 
 
 @njit(cache=True, nogil=True)
-def _find(key: Any, slots: Any, keys: Any) -> Any:
-    """Return the slot where ``key`` is, or the free one where it belongs."""
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    slot = np.int64((mixed ^ (mixed >> np.uint64(32))) & np.uint64(len(slots) - 1))
-    while slots[slot] >= 0 and keys[slots[slot]] != key:
-        slot = (slot + 1) & (len(slots) - 1)
-    return slot
+def _ordinal(tile: Any, tiles: Any, last: int, num_tiles: int) -> Any:
+    """Return the row of a tile among those met before, and how many were met by now."""
+    if num_tiles > 0 and tiles[last] == tile:
+        return last, num_tiles
+    for row in range(num_tiles):
+        if tiles[row] == tile:
+            return row, num_tiles
+    tiles[num_tiles] = tile
+    return num_tiles, num_tiles + 1
 
 
 @njit(cache=True, nogil=True)
-def _row(key: Any, slots: Any, keys: Any, num_voxels: int) -> Any:
-    """Return the row of a voxel, the first free one for a new voxel."""
-    slot = _find(key, slots, keys)
-    if slots[slot] < 0:
-        slots[slot] = num_voxels
-        keys[num_voxels] = key
-    return np.int64(slots[slot])
-
-
-@njit(cache=True, nogil=True)
-def _index(slots: Any, keys: Any, num_voxels: int) -> None:
-    for row in range(num_voxels):
-        slots[_find(keys[row], slots, keys)] = row
-
-
-@njit(cache=True, nogil=True)
-def _supported(voxels: Any, num_voxels: int, min_observations: int) -> Any:
-    """Return (num_voxels,) True where a voxel and its 26 neighbours were seen often enough."""
-    kept = np.zeros(num_voxels, np.bool_)
-    for row in range(num_voxels):
-        support = voxels.seen[row, 0]
-        for neighbour in range(27):
-            if support >= min_observations:
-                break
-            if neighbour == 13:
-                continue
-            x, y, z = neighbour // 9 - 1, neighbour // 3 % 3 - 1, neighbour % 3 - 1
-            # at the very border the sum may carry over: a neighbour too many, never a crash
-            key = voxels.keys[row] + (x << 2 * _BITS) + (y << _BITS) + z
-            slot = _find(key, voxels.slots, voxels.keys)
-            if voxels.slots[slot] >= 0:
-                support += voxels.seen[voxels.slots[slot], 0]
-        kept[row] = support >= min_observations
-    return kept
+def _integrate(view: Any, located: Any, is_wanted: Any, table: Any, state: Any) -> Any:
+    """Add the pixels of one frame; return the number of voxels."""
+    num_voxels, frame = state
+    width = view.depth.shape[1]
+    last_key, row = np.int64(-1), 0
+    for i in range(len(located.pixels)):
+        if not is_wanted[located.ordinals[i]]:
+            continue
+        v, u = located.pixels[i] // width, located.pixels[i] % width
+        key, weight = located.keys[i], view.weight[v, u]
+        if key != last_key:
+            row = row_of(key, table.slots, table.keys, num_voxels)
+            num_voxels = max(num_voxels, row + 1)
+            last_key = key
+        sums, normal = table.sums[row], surface_normal(view, v, u)
+        sums[0] += weight
+        for k in range(3):
+            sums[1 + k] += weight * located.inside[i, k]
+            sums[4 + k] += weight * np.float32(view.color[v, u, k])
+            sums[7 + k] += weight * np.float32(normal[k])
+        table.seen[row, 0] += table.seen[row, 1] != frame
+        table.seen[row, 1] = frame
+    return num_voxels

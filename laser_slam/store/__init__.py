@@ -7,7 +7,8 @@ from laser_slam.store.run import (
     new_run_folder,
     open_run_folder,
 )
-from laser_slam.store.tiles import Tile, TileEntry, TileFiles, TileIndex
+from laser_slam.store.sums import SumFiles, TileSums
+from laser_slam.store.tiles import Place, Tile, TileEntry, TileFiles, TileIndex
 from laser_slam.store.windows import (
     FORMAT_VERSION,
     WindowFiles,
@@ -19,10 +20,13 @@ from laser_slam.store.windows import (
 
 __all__ = [
     "FORMAT_VERSION",
+    "Place",
+    "SumFiles",
     "Tile",
     "TileEntry",
     "TileFiles",
     "TileIndex",
+    "TileSums",
     "WindowFiles",
     "atomic_write",
     "link_latest",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -197,7 +197,7 @@ class TileFiles:
         Raises:
             RunFolderError: the file is missing or damaged.
         """
-        with _reading(self._path(place)) as file:
+        with reading_tile(self._path(place)) as file:
             return Tile(**{field.name: file[field.name] for field in fields(Tile)})
 
     def save(self, place: Place, tile: Tile, tile_voxels: int) -> None:
@@ -211,8 +211,7 @@ class TileFiles:
         Raises:
             RunFolderError: the system could not write.
         """
-        is_outermost = ((tile.cells == 0) | (tile.cells == tile_voxels - 1)).any(axis=1)
-        rim = {"rim_cells": tile.cells[is_outermost], "rim_views": tile.views[is_outermost]}
+        rim = outermost(tile.cells, tile.views, tile_voxels)
         with atomic_write(self._path(place)) as partial, partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **vars(tile), **rim)
 
@@ -222,13 +221,29 @@ class TileFiles:
         Raises:
             RunFolderError: the file is missing or damaged.
         """
-        with _reading(self._path(place)) as file:
+        with reading_tile(self._path(place)) as file:
             return file["rim_cells"], file["rim_views"]
 
-    def remove(self, place: Place) -> None:
-        """Remove one tile, if it is there."""
-        with suppress(FileNotFoundError):
-            self._path(place).unlink()
+    def open(self, kept: Iterable[Place]) -> None:
+        """Begin to change the map: until the index is saved again, none is there.
+
+        Args:
+            kept: the tiles that stay; all others are removed.
+
+        Raises:
+            RunFolderError: the folder cannot be made or changed.
+        """
+        names = {tile_name(place) for place in kept}
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / _INDEX).unlink(missing_ok=True)
+            for path in self.folder.glob("*.npz"):
+                if path.name not in names:
+                    path.unlink()
+        except OSError as error:
+            raise RunFolderError(
+                f"cannot keep map tiles in {self.folder}: {error.strerror}; choose another folder"
+            ) from error
 
     def save_index(self, index: TileIndex) -> None:
         """Write the index: from here on, the map is finished.
@@ -240,11 +255,24 @@ class TileFiles:
         write_text(self.folder / _INDEX, text + "\n")
 
     def _path(self, place: Place) -> Path:
-        return self.folder / ("_".join(f"{part:d}" for part in place) + ".npz")
+        return self.folder / tile_name(place)
+
+
+def tile_name(place: Place) -> str:
+    """Return the name of a tile's file."""
+    return "_".join(f"{part:d}" for part in place) + ".npz"
+
+
+def outermost(
+    cells: NDArray[np.uint16], views: NDArray[Any], tile_voxels: int
+) -> dict[str, NDArray[Any]]:
+    """Pick the voxels at a tile's faces, for its neighbours: they need not read the whole tile."""
+    is_outermost = ((cells == 0) | (cells == tile_voxels - 1)).any(axis=1)
+    return {"rim_cells": cells[is_outermost], "rim_views": views[is_outermost]}
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[Any]:
+def reading_tile(path: Path) -> Iterator[Any]:
     """Open a tile; say of what is wrong with it that it is this file, and what to do."""
     try:
         with np.load(path, allow_pickle=False) as file:
