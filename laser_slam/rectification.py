@@ -54,6 +54,11 @@ class Rectifier:
         pixels = _source_pixels(lens, self.intrinsics, calibration.distortion, _grid(size))
         self._map = pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
 
+    @property
+    def bends(self) -> bool:
+        """Tell whether there is a distortion to take out."""
+        return self._map is not None
+
     def image(self, image: Image) -> Image:
         """Rectify an (H, W, 3) image of any size of the calibrated shape."""
         if image.shape[:2] != self._size:
