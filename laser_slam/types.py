@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +68,8 @@ class SequenceInfo:
         intrinsics: (3, 3) in pixels of the images; None: unknown.
         intrinsics_source: where they come from, or why they are unknown, in words.
         truth: poses in metres, for all frames or some; None: no ground truth.
+        files: the image of each frame; a single one: the video that all are of; empty: there are
+            none that another program could open.
     """
 
     name: str
@@ -75,6 +78,7 @@ class SequenceInfo:
     intrinsics: NDArray[np.float64] | None
     intrinsics_source: str
     truth: Trajectory | None = None
+    files: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ def command(
     name: str | None = None,
     *,
     group: typer.Typer = app,
-    options: type[RunOptions] = RunOptions,
+    options: type[Any] = RunOptions,
     verb: str = "",
 ) -> Callable[..., None]:
     """Make a function a command: its ``options`` become flags, its errors one line.
@@ -97,7 +97,7 @@ def command(
         function: whose parameter ``options``, if it has one, takes the shared options.
         name: of the command; None: the function's.
         group: that it belongs to.
-        options: the shared options that it takes.
+        options: dataclass of the options that it takes.
         verb: what is done with what the docstring names; empty: the docstring says it.
     """
     hints = get_type_hints(function, include_extras=True)
@@ -127,7 +127,7 @@ def command(
     return run
 
 
-def _shared_parameters(options: type[RunOptions]) -> list[inspect.Parameter]:
+def _shared_parameters(options: type[Any]) -> list[inspect.Parameter]:
     hints = get_type_hints(options, include_extras=True)
     kind = inspect.Parameter.KEYWORD_ONLY
     return [

@@ -69,6 +69,7 @@ class ImageFolder:
             len(self._paths),
             matrix,
             source,
+            files=tuple(self._paths),
         )
 
     @property

@@ -57,7 +57,9 @@ class KittiOdometry:
         header = check_same_kind(self._paths, AGAIN)
         intrinsics, source = _read_calibration(self._folder / "calib.txt", images, header.size)
         truth = _read_truth(root / "poses" / f"{name}.txt", self._times_s)
-        self._info = SequenceInfo(f"kitti-{name}", header.size, num, intrinsics, source, truth)
+        self._info = SequenceInfo(
+            f"kitti-{name}", header.size, num, intrinsics, source, truth, tuple(self._paths)
+        )
 
     @property
     def info(self) -> SequenceInfo:

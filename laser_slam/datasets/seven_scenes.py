@@ -63,6 +63,7 @@ class SevenScenes:
             resize_intrinsics(NOMINAL_INTRINSICS, NOMINAL_SIZE, header.size),
             "7-Scenes, nominal",
             _read_truth(self._paths),
+            tuple(self._files),
         )
 
     @property

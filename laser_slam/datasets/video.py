@@ -57,7 +57,7 @@ class VideoFile:
             capture.release()
         num = None if num is None else -(-num // stride)
         matrix, source = choose_intrinsics(size, intrinsics, fov_deg)
-        self._info = SequenceInfo(path.resolve().stem, size, num, matrix, source)
+        self._info = SequenceInfo(path.resolve().stem, size, num, matrix, source, files=(path,))
 
     @property
     def info(self) -> SequenceInfo:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from laser_slam.export import write_ply
+from laser_slam.results.keyframes import list_keyframes
 from laser_slam.results.loop_pictures import draw_loops
 from laser_slam.results.loops import Loops, write_loops
 from laser_slam.results.pictures import (
@@ -19,6 +20,7 @@ from laser_slam.results.pictures import (
 from laser_slam.results.scores import Scores
 from laser_slam.slam import Node, Slam
 from laser_slam.store import WindowFiles
+from laser_slam.store.keyframes import save_keyframes
 from laser_slam.types import Cloud, Trajectory
 
 
@@ -42,13 +44,14 @@ class Findings:
 
 
 def write_findings(folder: Path, found: Findings, slam: Slam) -> None:
-    """Write trajectories, map, closures and pose graph into the run's folder.
+    """Write trajectories, map, keyframes, closures and pose graph into the run's folder.
 
     Raises:
         RunFolderError: a file cannot be written.
     """
     write_trajectories(folder, found.trajectory, found.truth)
     write_ply(folder / "map.ply", found.cloud)
+    save_keyframes(folder, list_keyframes(slam))
     if found.loops is not None:
         write_loops(folder, found.loops, slam)
 
