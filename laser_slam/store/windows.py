@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
 import shutil
@@ -45,13 +46,17 @@ def save_prediction(path: Path, prediction: Prediction, colors: Image) -> tuple[
     Raises:
         RunFolderError: the system could not write.
     """
-    packed = _pack(prediction)
-    jpegs = [_encode_jpeg(image) for image in colors]
-    jpeg = np.frombuffer(b"".join(jpegs), np.uint8)
-    sizes = np.array([len(each) for each in jpegs], np.int64)
+    arrays = _pack_window(prediction, colors)
     with atomic_write(path) as partial, partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, **packed, jpeg=jpeg, jpeg_sizes=sizes)
-    return _unpack(packed), _decode_jpegs(jpeg, sizes)
+        np.savez(file, allow_pickle=False, **arrays)
+    return _unpack_window(arrays)
+
+
+def pack_window(prediction: Prediction, colors: Image) -> bytes:
+    """Return what ``save_prediction`` would write, to be sent elsewhere."""
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **_pack_window(prediction, colors))
+    return file.getvalue()
 
 
 def load_prediction(path: Path) -> tuple[Prediction, Image]:
@@ -64,8 +69,7 @@ def load_prediction(path: Path) -> tuple[Prediction, Image]:
         RunFolderError: the file is missing, damaged or of another version.
     """
     with _reading(path):
-        arrays = _arrays_of(path)
-        return _unpack(arrays), _decode_jpegs(arrays["jpeg"], arrays["jpeg_sizes"])
+        return _unpack_window(_arrays_of(path))
 
 
 def save_layers(path: Path, layers: Layers) -> None:
@@ -113,6 +117,15 @@ class WindowFiles:
         """Write a window; see ``save_prediction``."""
         return save_prediction(self._path("windows", index), prediction, colors)
 
+    def write(self, index: int, content: bytes) -> None:
+        """Write a window's file as ``pack_window`` has made it.
+
+        Raises:
+            RunFolderError: the system could not write.
+        """
+        with atomic_write(self._path("windows", index)) as partial:
+            partial.write_bytes(content)
+
     def adopt(self, index: int, other: WindowFiles) -> None:
         """Take a window's file from another folder: by a link where that can be, else a copy.
 
@@ -144,6 +157,21 @@ class WindowFiles:
                 "choose another folder with --out"
             )
         return prediction, colors
+
+    def stamp(self, index: int) -> str:
+        """Sum up the files of a window: differs when one was written anew with other content.
+
+        Raises:
+            RunFolderError: the window was not predicted.
+        """
+        path, layers = self._path("windows", index), self._path("layers", index)
+        digest = hashlib.blake2b(digest_size=16)
+        with _reading(path):
+            stat = path.stat()
+            digest.update(f"{stat.st_size} {stat.st_mtime_ns}".encode())
+        if layers.exists():  # small, and written again by each run that goes on
+            digest.update(layers.read_bytes())
+        return digest.hexdigest()
 
     def load_depth(self, index: int) -> Prediction:
         """Read a window back without its colours; see ``load_prediction``."""
@@ -185,6 +213,17 @@ def _arrays_of(path: Path) -> dict[str, NDArray[Any]]:
             "delete its run folder and run again"
         )
     return arrays
+
+
+def _pack_window(prediction: Prediction, colors: Image) -> dict[str, NDArray[Any]]:
+    jpegs = [_encode_jpeg(image) for image in colors]
+    jpeg = np.frombuffer(b"".join(jpegs), np.uint8)
+    sizes = np.array([len(each) for each in jpegs], np.int64)
+    return {**_pack(prediction), "jpeg": jpeg, "jpeg_sizes": sizes}
+
+
+def _unpack_window(arrays: dict[str, NDArray[Any]]) -> tuple[Prediction, Image]:
+    return _unpack(arrays), _decode_jpegs(arrays["jpeg"], arrays["jpeg_sizes"])
 
 
 def _pack(prediction: Prediction) -> dict[str, NDArray[Any]]:
