@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from pathlib import Path
 from typing import Any
@@ -11,16 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from laser_slam.errors import DatasetError, RunFolderError
+from laser_slam.errors import DatasetError
 from laser_slam.evaluation.trajectory import evaluate_trajectory
-from laser_slam.results import CHAINED_FILE, draw_trajectory, write_report
+from laser_slam.results import (
+    CHAINED_FILE,
+    describe_paths,
+    draw_trajectory,
+    read_report,
+    write_report,
+    write_report_page,
+)
 from laser_slam.types import Trajectory
 
 Array = NDArray[np.float64]
 
 
 def rescore(folder: Path, truth_file: Path | None = None) -> dict[str, Any]:
-    """Compare a run's trajectory with the truth; write scores, trajectory.png and drift.png anew.
+    """Compare a run's trajectory with the truth; write its scores, their pictures and page anew.
 
     Args:
         folder: of a finished run.
@@ -34,7 +40,7 @@ def rescore(folder: Path, truth_file: Path | None = None) -> dict[str, Any]:
         RunFolderError: no finished run is there, or it cannot be written.
         DatasetError: there is no truth, it cannot be read or does not fit the run.
     """
-    report = _read_report(folder / "report.json")
+    report = dict(read_report(folder))
     trajectory = read_trajectory(folder / "trajectory_tum.txt", None)
     kept = folder / "truth_tum.txt"
     if truth_file is None and not kept.exists():
@@ -45,10 +51,14 @@ def rescore(folder: Path, truth_file: Path | None = None) -> dict[str, Any]:
         raise DatasetError(f"{truth_file or kept} cannot score {folder}: {errors.reason}")
     draw_trajectory(folder / "pictures", trajectory, truth, errors)
     report["trajectory"] = errors.numbers()
-    if report.get("closures"):
+    chained, without = None, None
+    if report.get("closures") and (folder / CHAINED_FILE).exists():
         chained = read_trajectory(folder / CHAINED_FILE, None)
-        report["closures"]["trajectory_without"] = evaluate_trajectory(chained, truth).numbers()
+        without = evaluate_trajectory(chained, truth)
+        report["closures"]["trajectory_without"] = without.numbers()
+    report["paths"] = describe_paths(trajectory, chained, truth, (errors, without))
     write_report(folder / "report.json", report)
+    write_report_page(folder)
     return report
 
 
@@ -107,17 +117,3 @@ def _read_table(path: Path) -> Array:
     if table.shape[1] == 8 and not np.linalg.norm(table[:, 4:], axis=1).all():
         raise DatasetError(f"{path} has a quaternion of zeros; TUM's lines are t x y z qx qy qz qw")
     return np.asarray(table, np.float64)
-
-
-def _read_report(path: Path) -> dict[str, Any]:
-    try:
-        report = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RunFolderError(
-            f"no finished run in {path.parent}; give a run folder, such as runs/latest"
-        ) from error
-    except ValueError as error:
-        raise RunFolderError(f"{path} is damaged: {error}") from error
-    if not isinstance(report, dict):
-        raise RunFolderError(f"{path} is no report of a run")
-    return report

@@ -2,6 +2,8 @@
 
 from laser_slam.results.findings import Findings, draw_findings, write_findings
 from laser_slam.results.loops import CHAINED_FILE, Loops, describe_loops, look_back
+from laser_slam.results.page import read_report, write_report_page
+from laser_slam.results.paths import describe_paths
 from laser_slam.results.pictures import draw_trajectory
 from laser_slam.results.report import (
     Results,
@@ -16,6 +18,7 @@ from laser_slam.results.scores import (
     sample_views,
     score_views,
 )
+from laser_slam.results.windows import describe_course, describe_windows
 
 __all__ = [
     "CHAINED_FILE",
@@ -24,15 +27,20 @@ __all__ = [
     "Loops",
     "Results",
     "Scores",
+    "describe_course",
     "describe_layers",
     "describe_loops",
+    "describe_paths",
     "describe_sequence",
     "describe_system",
+    "describe_windows",
     "draw_findings",
     "draw_trajectory",
     "look_back",
+    "read_report",
     "sample_views",
     "score_views",
     "write_findings",
     "write_report",
+    "write_report_page",
 ]

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
+import PIL.Image
 
 from laser_slam.closures import ClosureRecord
-from laser_slam.errors import DegenerateGeometryError
-from laser_slam.evaluation.trajectory import align, path_distances
+from laser_slam.evaluation.trajectory import path_distances
 from laser_slam.report import (
     ImagePair,
     LoopPaths,
@@ -22,11 +23,14 @@ from laser_slam.report import (
     similarity_picture,
 )
 from laser_slam.results.loops import Loops
+from laser_slam.results.paths import on_truth
 from laser_slam.slam import Node
-from laser_slam.store import WindowFiles
+from laser_slam.store import WindowFiles, atomic_write
 from laser_slam.types import Image, Trajectory
 
 MAX_PAIRS = 12  # on the sheet of image pairs
+MAX_THUMBNAILS = 24  # pairs of small images beside the table of loops
+_THUMBNAIL_PX = 320
 
 
 def draw_loops(
@@ -54,14 +58,17 @@ def draw_loops(
     )
     path, found = pictures / "similarity.png", loops.similarities
     similarity_picture(path, found.similarities, found.frames, found.per_cell, accepted, rejected)
-    chained, closed, truth, scales = _on_truth(loops, trajectory)
+    (chained, closed), truth, scales = on_truth([loops.chained, trajectory], loops.truth)
     if len(loops.records):
         paths = LoopPaths(chained, closed, truth, accepted, rejected)
         loops_picture(pictures / "loops.png", paths)
         shown = choose_pairs(loops.records, MAX_PAIRS)
         title = f"{len(shown)} of {len(loops.records)} candidates"
         pairs_picture(pictures / "loop_pairs.png", _image_pairs(shown, files), title)
-    scales_picture(pictures / "scales.png", scale_curves(nodes, closed, truth, scales))
+        write_thumbnails(pictures, choose_pairs(loops.records, MAX_THUMBNAILS), files)
+    scales_picture(
+        pictures / "scales.png", scale_curves(nodes, closed, truth, (scales[0], scales[1]))
+    )
 
 
 def choose_pairs(records: Sequence[ClosureRecord], num: int) -> list[ClosureRecord]:
@@ -80,6 +87,30 @@ def choose_pairs(records: Sequence[ClosureRecord], num: int) -> list[ClosureReco
         for k in np.unique(np.linspace(0, len(part) - 1, min(count, len(part))).round().astype(int))
     ]
     return chosen
+
+
+def thumbnail(pictures: Path, frame: int) -> Path:
+    """Name the small image of a frame among a run's pictures."""
+    return pictures / "frames" / f"{frame:06d}.jpg"
+
+
+def write_thumbnails(pictures: Path, records: Sequence[ClosureRecord], files: WindowFiles) -> None:
+    """Write a small image of each frame of the records, each window being read once.
+
+    Raises:
+        RunFolderError: an image cannot be written.
+    """
+    ends = {(r.window_a, r.frame_a) for r in records} | {(r.window_b, r.frame_b) for r in records}
+    for window, members in groupby(sorted(ends), key=itemgetter(0)):
+        prediction, colors = files.load(window)
+        for _, frame in members:
+            row = int(np.searchsorted(prediction.frames, frame))
+            small = PIL.Image.fromarray(colors[row])
+            small.thumbnail((_THUMBNAIL_PX, _THUMBNAIL_PX))
+            path = thumbnail(pictures, frame)
+            with atomic_write(path) as partial:
+                path.parent.mkdir(exist_ok=True)
+                small.save(partial, "JPEG", quality=80)
 
 
 def scale_curves(
@@ -120,24 +151,6 @@ def _true_scale(node: Node, truth: Trajectory) -> float:
         )
     )
     return true / found if found > 0 and true > 0 else float("nan")
-
-
-def _on_truth(
-    loops: Loops, closed: Trajectory
-) -> tuple[Trajectory, Trajectory, Trajectory | None, tuple[float, float]]:
-    """Align both paths to the truth, each by its own Sim(3); without one they stay."""
-    if loops.truth is None:
-        return loops.chained, closed, None, (1.0, 1.0)
-    try:
-        aligned, scales = [], []
-        for path in (loops.chained, closed):
-            truth_from_world = align(path, loops.truth, with_scale=True)
-            poses = truth_from_world.apply_poses(path.world_from_cam)
-            aligned.append(replace(path, world_from_cam=poses))
-            scales.append(truth_from_world.scale)
-    except DegenerateGeometryError:
-        return loops.chained, closed, None, (1.0, 1.0)
-    return aligned[0], aligned[1], loops.truth, (scales[0], scales[1])
 
 
 def _image_pairs(records: Sequence[ClosureRecord], files: WindowFiles) -> list[ImagePair]:

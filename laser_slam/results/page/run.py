@@ -1,0 +1,227 @@
+"""The page's account of the run itself: settings, time, calibration, counters, files."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from pydantic import BaseModel
+
+from laser_slam import __version__
+from laser_slam.config import Config
+from laser_slam.report.html import Bar, Bars, Block, Fold, Notes, Section, Table, Text
+from laser_slam.results.page.reading import (
+    Report,
+    count,
+    file_size,
+    flatten,
+    look,
+    number,
+    percent,
+    plain,
+    say,
+)
+
+_MAX_WARNINGS = 300
+_NUMBER = re.compile(r"\d+(\.\d+)?")
+# What the page shows in full elsewhere, or is no counter.
+_SERIES = ("records", "sigmas", "refused", "trajectory_without", "windows", "bridged")
+
+
+def facts(report: Report) -> list[str]:
+    """Say in a few words each what was run."""
+    read, keyframes = number(report, "frames.read"), number(report, "frames.keyframes")
+    unreadable = number(report, "frames.unreadable")
+    width, height = number(report, "sequence.width"), number(report, "sequence.height")
+    backbone = look(report, "settings.backbone.name")
+    found = [
+        f"{count(read)} frames" if read is not None else "",
+        f"{count(keyframes)} keyframes" if keyframes is not None else "",
+        f"{count(unreadable)} unreadable" if unreadable else "",
+        f"{width:.0f} × {height:.0f}" if width and height else "",
+        f"{count(number(report, 'windows.num'))} windows" if look(report, "windows") else "",
+        f"backbone {backbone}" if backbone else "",
+        f"laser-slam {look(report, 'versions.laser-slam') or '(version unknown)'}",
+        str(look(report, "finished") or "").replace("T", " ")[:16],
+    ]
+    return [text for text in found if text]
+
+
+def group_warnings(warnings: Sequence[str]) -> list[str]:
+    """Say warnings that differ in their numbers only once, with how many there are.
+
+    >>> group_warnings(["frame 4 cannot be read", "frame 5 cannot be read", "the map is empty"])
+    ['frame 4 cannot be read (and 1 more like it)', 'the map is empty']
+    """
+    alike: defaultdict[str, list[str]] = defaultdict(list)
+    for warning in warnings:
+        alike[_NUMBER.sub("N", warning)].append(warning)
+    return [
+        each[0] + (f" (and {count(len(each) - 1)} more like it)" if len(each) > 1 else "")
+        for each in alike.values()
+    ]
+
+
+def time_by_stage(report: Report) -> Section:
+    """Show where the time went, longest first."""
+    wall = look(report, "seconds.wall") or {}
+    total = sum(wall.values())
+    stages = sorted(wall, key=lambda stage: -wall[stage])
+    bars = [
+        Bar(
+            stage,
+            wall[stage] / total if total else 0.0,
+            [
+                f"{wall[stage]:,.1f}",
+                percent(wall[stage] / total, 2) if total else "",
+                f"{number(report, f'seconds.cpu.{stage}') or 0:,.1f}",
+            ],
+        )
+        for stage in stages
+    ]
+    if not bars:
+        return Section("time", "Time", [])
+    cpu = say(number(report, "seconds.cpu_in_all"))
+    caption = f"{say(total)} s in all" + (f", {cpu} s of processor time" if cpu else "")
+    head = ["stage", "share of the wall time", "s", "share", "processor s"]
+    return Section("time", "Time", [Bars(caption, head, bars)])
+
+
+def settings(report: Report) -> Section:
+    """Show the settings that differ from the defaults, then all of them, then versions."""
+    given = look(report, "settings")
+    if not given:
+        return Section("settings", "Settings", [])
+    defaults = dict(flatten(Config().model_dump(mode="json")))
+    words = dict(_descriptions(Config))
+    rows = [
+        [name, plain(value), _default(defaults, name), words.get(name, "")]
+        for name, value in flatten(given)
+    ]
+    changed = [row for row in rows if row[1] != row[2]]
+    head = ["setting", "value", "default", "meaning"]
+    caption = f"Settings that differ from the defaults of laser-slam {__version__}"
+    blocks: list[Block] = []
+    if changed:
+        blocks.append(Table(caption, head, changed, frozenset({3})))
+    else:
+        blocks.append(Text("All settings are the defaults."))
+    every = Table("All settings", head, rows, frozenset({3}))
+    blocks.append(Fold(f"All {len(rows)} settings", [every]))
+    return Section("settings", "Settings", blocks)
+
+
+def _default(defaults: dict[str, Any], name: str) -> str:
+    return plain(defaults[name]) if name in defaults else ""
+
+
+def _descriptions(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str]]:
+    for key, field in model.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from _descriptions(field.annotation, f"{prefix}{key}.")
+        else:
+            yield prefix + key, field.description or ""
+
+
+def details(report: Report, folder: Path) -> Section:
+    """Show calibration, counters, all warnings, versions and the files beside the page."""
+    blocks = [_calibration(report), _counters(report), *_warnings(report)]
+    versions = [[name, plain(value)] for name, value in flatten(look(report, "versions") or {})]
+    if versions:
+        table = Table("Versions", ["package", "version"], versions, frozenset({1}))
+        blocks.append(Fold("Versions", [table]))
+    return Section("details", "Details", [*blocks, _files(folder)])
+
+
+def _calibration(report: Report) -> Block:
+    rows = [
+        [text, *(say(number(report, f"sequence.{key}.{name}"), 5) for name in _FOUR)]
+        for key, text in (("intrinsics", "as used"), ("intrinsics_given", "as given"))
+        if look(report, f"sequence.{key}")
+    ]
+    distortion = look(report, "sequence.distortion")
+    text = (
+        f"Calibration: {plain(look(report, 'sequence.calibration'))}. "
+        f"Source: {plain(look(report, 'sequence.intrinsics_source'))}. "
+        f"Distortion: {plain(distortion)}."
+    )
+    table = Table("Pinhole camera, pixels of the input", ["intrinsics", *_FOUR], rows)
+    return Fold("Calibration", [Text(text), *([table] if rows else [])])
+
+
+_FOUR = ("fx", "fy", "cx", "cy")
+
+
+def _counters(report: Report) -> Block:
+    rows = [
+        [name, plain(value)]
+        for part in ("frames", "windows", "layers", "closures", "map")
+        for name, value in flatten({part: _without_series(look(report, part))})
+    ]
+    for name in ("peak_memory_mib", "frames_per_second"):
+        rows.append([name, plain(look(report, name))])
+    table = Table("Names as in report.json; null: unknown", ["counter", "value"], rows)
+    return Fold("Counters", [table])
+
+
+def _without_series(part: Any) -> Any:
+    if not isinstance(part, dict):
+        return part
+    kept = {key: value for key, value in part.items() if key not in _SERIES}
+    lengths = {
+        key: len(part[key]) for key in ("bridged", "refused") if isinstance(part.get(key), dict)
+    }
+    return {**kept, **lengths}
+
+
+def _warnings(report: Report) -> list[Block]:
+    warnings = [str(warning) for warning in look(report, "warnings") or []]
+    if not warnings:
+        return []
+    shown = warnings[:_MAX_WARNINGS]
+    more = len(warnings) - len(shown)
+    rest = [Text(f"{count(more)} more are in run.log.")] if more else []
+    return [Fold(f"All {count(len(warnings))} warnings", [Notes(shown), *rest])]
+
+
+def _files(folder: Path) -> Block:
+    """List the run's folder; folders within it in one row each."""
+    rows: list[list[str]] = []
+    links: dict[int, str] = {}
+    entries = sorted(folder.iterdir(), key=lambda path: (path.is_dir(), path.name))
+    for path in entries:
+        if path.name.startswith(".") or path.name == "report.html":
+            continue
+        if path.is_dir():
+            inner = [each for each in path.rglob("*") if each.is_file()]
+            size = sum(each.stat().st_size for each in inner)
+            row = [f"{path.name}/", file_size(size), f"{count(len(inner))} files"]
+        else:
+            row = [path.name, file_size(path.stat().st_size), _MEANINGS.get(path.name, "")]
+        links[len(rows)] = quote(row[0])
+        rows.append(row)
+    table = Table(
+        "Links work where the page lies in the run's folder", _FILES, rows, frozenset({2}), links
+    )
+    return Fold("Files", [table])
+
+
+_FILES = ("file", "size", "holds")
+_MEANINGS = {
+    "report.json": "all numbers of this page, for machines",
+    "config.yaml": "all settings",
+    "sequence.yaml": "what tells the input from others",
+    "calibration.yaml": "the camera, lens included",
+    "map.ply": "the map, in world units",
+    "trajectory_kitti.txt": "a pose for every frame, KITTI's format",
+    "trajectory_tum.txt": "a pose for every frame, TUM's format",
+    "trajectory_without_loops_tum.txt": "the same by the registrations alone",
+    "truth_tum.txt": "true poses, metres",
+    "closures.json": "what became of each candidate of a loop",
+    "graph.g2o": "the pose graph",
+    "run.log": "what the run said",
+}
