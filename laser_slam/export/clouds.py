@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -21,17 +21,18 @@ _NORMALS = ("nx", "ny", "nz")
 _PLY_TYPES = {"f4": "float", "f8": "double", "u1": "uchar"}
 
 
-def write_ply(path: Path, cloud: Cloud) -> None:
-    """Write a cloud as binary PLY: positions in world units, colours as bytes, weights.
+def write_ply(path: Path, cloud: Cloud | Callable[[], Iterator[Cloud]]) -> None:
+    """Write a cloud, or what reads its parts, as binary PLY: positions, colours, weights.
 
-    Positions are float32 where rounding moves no point by more than a hundredth of a voxel, else
-    float64: no offset is taken off, so that every reader sees world coordinates. The weight of a
-    point is its property ``weight`` (float32). Normals, where there are, are float32.
+    Positions are in world units, float32 where rounding moves no point by more than a hundredth
+    of a voxel, else float64: no offset is taken off, so that every reader sees world coordinates.
+    The weight of a point is its property ``weight`` (float32). Normals, where there are, are
+    float32.
 
     Raises:
         RunFolderError: the folder is missing, cannot be written or is full.
     """
-    _write_ply(path, survey(lambda: iter([cloud])))
+    _write_ply(path, survey(cloud if callable(cloud) else lambda: iter([cloud])))
 
 
 def export_ply(path: Path, source: Source) -> None:
