@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from PIL import Image as Pillow
 
 from laser_slam.camera import distort, resize_intrinsics
 from laser_slam.errors import DegenerateGeometryError, RunFolderError
@@ -61,10 +62,7 @@ class Rectifier:
 
     def image(self, image: Image) -> Image:
         """Rectify an (H, W, 3) image of any size of the calibrated shape."""
-        if image.shape[:2] != self._size:
-            shrinks = self._size[0] * self._size[1] < image.shape[0] * image.shape[1]
-            method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-            image = np.asarray(cv2.resize(image, self._size[::-1], interpolation=method))
+        image = resize_image(image, self._size)
         if self._map is None:
             return image
         return np.asarray(cv2.remap(image, *self._map, cv2.INTER_CUBIC, None, cv2.BORDER_REPLICATE))
@@ -77,6 +75,17 @@ class Rectifier:
             return np.asarray(small)
         options = (cv2.INTER_NEAREST, None, cv2.BORDER_CONSTANT, np.nan)
         return np.asarray(cv2.remap(small, *self._map, *options))
+
+
+def resize_image(image: Image, size: tuple[int, int]) -> Image:
+    """Return (height, width, 3) of an RGB image: bicubic over all pixels that a new one covers.
+
+    To the grey level what Pillow makes of it, for that is what networks were fed with.
+    """
+    if image.shape[:2] == size:
+        return image
+    resized = Pillow.fromarray(image).resize(size[::-1], Pillow.Resampling.BICUBIC)
+    return np.array(resized)
 
 
 def save_calibration(path: Path, calibration: Calibration) -> None:

@@ -260,7 +260,7 @@ def test_shrinking_averages_instead_of_picking_pixels() -> None:
     stripes[:, ::4] = 200
     frames = [Frame(index, index, stripes) for index in range(3)]
     window = next(cut_windows(frames, WindowsConfig(size=3, overlap=1), resized((2, 4))))
-    assert np.all(window.images[0] == 50)
+    assert np.abs(window.images[0].astype(int) - 50).max() <= 20  # a picked pixel is 0 or 200
 
 
 def test_too_few_keyframes_are_refused_with_advice() -> None:

@@ -18,8 +18,14 @@ if TYPE_CHECKING:
 BACKBONES = {
     "classical": "laser_slam.backbones.classical:ClassicalBackbone",
     "simulated": "laser_slam.backbones.simulated:SimulatedBackbone",
+    "pi3": "laser_slam.backbones.pi3:Pi3Backbone",
+    "pi3x": "laser_slam.backbones.pi3x:Pi3XBackbone",
+    "vggt": "laser_slam.backbones.vggt:VggtBackbone",
+    "depth_anything3": "laser_slam.backbones.depth_anything3:DepthAnything3Backbone",
 }
+NETWORKS = {"pi3", "pi3x", "vggt"}  # whose memory is known
 WINDOW_SIZE = 20  # keyframes, where memory is no limit
+ON_CPU = {"classical", "simulated"}
 FROM_TRUTH = {"simulated"}  # these are made from what the data set knows, too
 
 
@@ -51,5 +57,18 @@ def choose_window_size(config: BackboneConfig, size: tuple[int, int], overlap: i
         config: of the backbone.
         size: (height, width) of the data set's images.
         overlap: keyframes that neighbouring windows share.
+
+    Raises:
+        ConfigError: the network's device is not there.
+        DependencyError: PyTorch is not installed.
     """
-    return max(overlap + 3, WINDOW_SIZE)
+    if config.name not in NETWORKS:
+        return max(overlap + 3, WINDOW_SIZE)
+    from laser_slam.backbones.feedforward import fitting_window  # noqa: PLC0415
+
+    return fitting_window(config.name, getattr(config, config.name), size, overlap)
+
+
+def is_on_cpu(config: BackboneConfig) -> bool:
+    """Tell whether the backbone has no use for a GPU."""
+    return config.name in ON_CPU

@@ -30,8 +30,23 @@ class NetworkConfig(Section):
         "fitted", description="of the depth maps: what the network sees, or what the data set says"
     )
 
+    @property
+    def size_limit(self) -> int:
+        """Return what the size rule keeps to: the longer side in pixels, or their number."""
+        return self.side if self.size_rule == "side" else self.num_pixels
+
 
 class Pi3XConfig(NetworkConfig):
     """Pi3X, which is told of the camera."""
 
     told_intrinsics: bool = Field(True, description="known intrinsics are a prior of the network")
+
+
+class DepthAnything3Config(Section):
+    """Depth Anything 3, by its authors' own package."""
+
+    model: str = Field(
+        "depth-anything/DA3-LARGE", description="name on the Hugging Face hub, or a folder"
+    )
+    device: str = Field("auto", description="cpu, cuda, cuda:1; auto: cuda if it is there")
+    side: int = Field(504, ge=28, le=4096, multiple_of=14, description="longer side of images, px")

@@ -1,0 +1,169 @@
+"""What backbones that are one pass of a network do alike."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.backbones.feedforward.camera import take_calibration
+from laser_slam.backbones.feedforward.sizes import network_size
+from laser_slam.backbones.feedforward.view import View, to_prediction
+from laser_slam.config.networks import NetworkConfig
+from laser_slam.dependencies import import_torch
+from laser_slam.errors import ConfigError
+from laser_slam.types import Calibration, Image, Prediction, Window
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from torch import Tensor
+
+    from laser_slam.networks.weights import Checkpoint
+
+FORMAT = 1  # rises when the same network makes other predictions of the same images
+
+
+class NetworkBackbone(ABC):
+    """A frozen network: all images of a window in, depth and poses out, in one pass.
+
+    What is wrong with settings, device or weights is said at once; the weights are read when the
+    first window is predicted, so that a run whose windows are all stored never reads them.
+
+    Args:
+        config: of this network.
+        network: a network that is used as it is, instead of weights from a file; None: those.
+
+    Attributes:
+        name: of the network, as in the settings.
+        remembers: False, see `laser_slam.backbones.base.Backbone`.
+        sees_far_frames: True, same.
+
+    Raises:
+        ConfigError: the device is not there.
+        DependencyError: PyTorch is not installed.
+        WeightsError: the weights are not there and cannot be had.
+    """
+
+    name: ClassVar[str]
+    remembers = False
+    sees_far_frames = True
+
+    def __init__(self, config: NetworkConfig, network: Any = None) -> None:
+        import_torch()
+        from laser_slam.networks.hub import find_weights  # noqa: PLC0415  (needs torch)
+        from laser_slam.networks.placement import choose_placement  # noqa: PLC0415
+
+        self._config = config
+        self._placement = choose_placement(config.device, config.dtype, f"backbone.{self.name}")
+        self._given = network
+        self._weights = None
+        if network is None:
+            self._weights = find_weights(config.weights, self._checkpoint())
+
+    @abstractmethod
+    def _checkpoint(self) -> Checkpoint:
+        """Return where the weights come from."""
+
+    @abstractmethod
+    def _load(self, weights: Path) -> Any:
+        """Read the network from its file."""
+
+    @abstractmethod
+    def _view(self, network: Any, images: Tensor, intrinsics: NDArray[np.float64] | None) -> View:
+        """Run the network on (1, N, 3, H, W) images in [0, 1] and read its outputs.
+
+        Args:
+            network: on the device.
+            images: on the device.
+            intrinsics: (3, 3) in pixels of these images; None: unknown.
+        """
+
+    def identity(self) -> dict[str, Any]:
+        """Return network, checkpoint and settings; see `laser_slam.backbones.base.Backbone`.
+
+        The device is none of it, but what it computes in is.
+        """
+        return {
+            "network": self.name,
+            "checkpoint": self._hash,
+            "dtype": self._placement.dtype_name,
+            "size": {self._config.size_rule: self._config.size_limit},
+            "intrinsics": self._config.intrinsics,
+            "format": FORMAT,
+        }
+
+    def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
+        """Return the (height, width) at which it wants images of (height, width) ``size``."""
+        return network_size(size, self._config.size_rule, self._config.size_limit)
+
+    def calibrate(
+        self, windows: Iterable[Window], intrinsics: NDArray[np.float64] | None
+    ) -> Calibration:
+        """Return what was given: the network finds its own camera for each window.
+
+        Raises:
+            DegenerateGeometryError: there is no window.
+        """
+        uses = self._config.intrinsics == "given"
+        return take_calibration(windows, intrinsics, self.name, is_used=uses)
+
+    def predict(
+        self,
+        images: Sequence[Image],
+        frames: NDArray[np.int64],
+        intrinsics: NDArray[np.float64] | None,
+    ) -> Prediction:
+        """Predict one window; see `laser_slam.backbones.base.Backbone`.
+
+        Raises:
+            ConfigError: the window is too large for the device's memory, or the depth maps are to
+                have given intrinsics and there are none.
+            WeightsError: the weights cannot be read or are of another network.
+        """
+        if self._config.intrinsics == "given" and intrinsics is None:
+            raise ConfigError(
+                f"backbone.{self.name}.intrinsics: 'given', but this input has none; "
+                "give them, or use 'fitted'"
+            )
+        pixels, network = np.stack(images), self._network
+        free_bytes = self._placement.free_bytes()
+        try:
+            with self._placement.computing():
+                view = self._view(network, self._placement.upload(pixels), intrinsics)
+        except RuntimeError as error:
+            advice = self._memory_advice(error, pixels.shape, free_bytes)
+            if advice is None:
+                raise
+            raise ConfigError(advice) from error
+        return to_prediction(view, frames)
+
+    @cached_property
+    def _network(self) -> Any:
+        network = self._given if self._weights is None else self._load(self._weights)
+        return network.to(self._placement.device)
+
+    @cached_property
+    def _hash(self) -> str:
+        from laser_slam.networks.hub import hash_file, hash_weights  # noqa: PLC0415
+
+        if self._weights is None:
+            return hash_weights(self._given)
+        return hash_file(self._weights)
+
+    def _memory_advice(
+        self, error: RuntimeError, shape: tuple[int, ...], free_bytes: int
+    ) -> str | None:
+        """Say what to do where memory was too short for images of ``shape``; else None."""
+        from laser_slam.networks.memory import Job, advise  # noqa: PLC0415
+        from laser_slam.networks.placement import is_out_of_memory  # noqa: PLC0415
+
+        if not is_out_of_memory(error):
+            return None
+        size = (shape[1], shape[2])
+        job = Job(self.name, size, self._placement.dtype_name, self._config.chunk)
+        return advise(job, shape[0], free_bytes, f"backbone.{self.name}")
