@@ -26,6 +26,8 @@ _PLY_VERTEX = [
 ]
 _PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
+# Open3D takes the pixel at the truncated coordinates: its pixels begin where ours have their centre.
+_TO_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 _NEIGHBOURS = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3), axis=-1).reshape(-1, 3)
 
 Tile = tuple[int, int, int]
@@ -184,7 +186,7 @@ class _Volume:
         return (
             image(tensor(np.ascontiguousarray(depth))),
             image(tensor(np.ascontiguousarray(color))),
-            tensor(np.ascontiguousarray(view.intrinsics)),
+            tensor(np.ascontiguousarray(view.intrinsics + _TO_CORNER)),
             tensor(np.linalg.inv(view.world_from_cam)),
         )
 
