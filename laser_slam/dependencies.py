@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import import_module
@@ -107,6 +108,33 @@ def import_rerun() -> Any:
             "pip install 'laser-slam[viewer]'"
         ) from error
     return rerun
+
+
+@cache
+def import_ray() -> Any:
+    """Import Ray, which only predicting on several GPUs or machines needs.
+
+    Raises:
+        DependencyError: Ray is missing or cannot be loaded; says how to get it.
+    """
+    try:
+        import ray  # noqa: PLC0415  (seconds, and only a fleet needs it)
+        import ray.exceptions  # noqa: PLC0415
+    except (ImportError, OSError) as error:
+        raise DependencyError(
+            f"Ray cannot be loaded ({error}); install it: pip install 'laser-slam[ray]'"
+        ) from error
+    return ray
+
+
+def num_threads() -> int:
+    """Return how many threads are worth having: as OMP_NUM_THREADS says, or one for each core."""
+    told = os.environ.get("OMP_NUM_THREADS", "")
+    if told.isdecimal() and int(told):
+        return int(told)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _preload_libusb() -> None:

@@ -18,6 +18,7 @@ from laser_slam.config.sections import (
     WindowsConfig,
 )
 from laser_slam.config.simulated import SimulatedConfig
+from laser_slam.config.viewer import ViewerConfig
 
 __all__ = [
     "BackboneConfig",
@@ -39,6 +40,7 @@ __all__ = [
     "SimulatedConfig",
     "SyntheticConfig",
     "VerificationConfig",
+    "ViewerConfig",
     "WindowsConfig",
     "dump_config",
     "load_config",

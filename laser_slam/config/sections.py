@@ -13,6 +13,7 @@ from laser_slam.config.fusion import FusionConfig
 from laser_slam.config.layers import LayersConfig
 from laser_slam.config.places import PlacesConfig
 from laser_slam.config.section import Section as _Section
+from laser_slam.config.viewer import ViewerConfig
 
 MIN_WINDOW = 3  # keyframes
 
@@ -137,6 +138,7 @@ class Config(_Section):
     pose_graph: PoseGraphConfig = PoseGraphConfig()
     fusion: FusionConfig = FusionConfig()
     export: ExportConfig = ExportConfig()
+    viewer: ViewerConfig = ViewerConfig()
     synthetic: SyntheticConfig = SyntheticConfig()
     run: RunConfig = RunConfig()
 
