@@ -198,7 +198,7 @@ class Aggregator(nn.Module):
     def _embed(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Return (B N, 5 + h w, D) tokens and the (B, N, D) means of those of patches."""
         patches = self.patch_embed(images.flatten(0, 1)).patches
-        means = patches.float().mean(1).view(*images.shape[:2], -1)
+        means = patches.mean(1, dtype=torch.float32).view(*images.shape[:2], -1)
         special = torch.cat([self.camera_token, self.register_token], 2).to(patches)
         others = special[:, 1:].expand(-1, images.shape[1] - 1, -1, -1)
         frames = torch.cat([special[:, :1], others], 1).expand(len(images), -1, -1, -1)
