@@ -20,6 +20,7 @@ IMAGE_MEAN = (0.485, 0.456, 0.406)  # of ImageNet: red, green, blue in [0, 1]
 IMAGE_STD = (0.229, 0.224, 0.225)
 NORMALISATION = {"image_mean": IMAGE_MEAN, "image_std": IMAGE_STD}  # as some checkpoints hold them
 PATCH = 14  # side, px
+COLOURS = 3
 NORM_EPS = 1e-6
 EXTRA = 0.1  # cells; part of the factor by which 'factor' resamples
 
@@ -34,6 +35,7 @@ class EncoderConfig:
         num_heads: of the attention; they share the width.
         num_registers: extra tokens between the class token and the patches.
         grid: side of the table of positions, in patches.
+        channels: of the maps; 3: RGB images in [0, 1], which are normalised first.
         resampling: of that table. 'size': to the image's grid, smoothed (pi3, VGGT); 'factor': by
             (cells + 0.1) / grid, not smoothed (the first DINOv2, thus SALAD). A network is right
             with the one that it was trained with only.
@@ -44,6 +46,7 @@ class EncoderConfig:
     num_heads: int
     num_registers: int = 0
     grid: int = 37
+    channels: int = 3
     resampling: Literal["size", "factor"] = "size"
 
 
@@ -78,7 +81,10 @@ class Encoder(nn.Module):
         self.pos_embed = nn.Parameter(torch.zeros(1, 1 + config.grid**2, width))
         if config.num_registers:
             self.register_tokens = nn.Parameter(torch.zeros(1, config.num_registers, width))
-        self.patch_embed = PatchEmbedding(width)
+        is_coloured = config.channels == COLOURS
+        self.patch_embed = (
+            ImageEmbedding(width) if is_coloured else PatchEmbedding(width, config.channels)
+        )
         shape = BlockConfig(width, config.num_heads, eps=NORM_EPS)
         self.blocks = nn.ModuleList(Block(shape) for _ in range(config.depth))
         self.norm = nn.LayerNorm(width, eps=NORM_EPS)
@@ -87,7 +93,8 @@ class Encoder(nn.Module):
         """Encode images of one size.
 
         Args:
-            images: (B, 3, H, W) RGB in [0, 1]; H and W are multiples of ``PATCH``.
+            images: (B, channels, H, W), three being RGB in [0, 1]; H and W are multiples of
+                ``PATCH``.
 
         Returns:
             Normalised tokens, in the dtype of the weights or of a surrounding autocast.
@@ -135,17 +142,25 @@ class Encoder(nn.Module):
 
 
 class PatchEmbedding(nn.Module):
-    """A token for each patch of an image, from its pixels alone."""
+    """A token for each patch of a map, from its pixels alone."""
 
-    def __init__(self, width: int) -> None:
-        """Build it for tokens of ``width`` channels."""
+    def __init__(self, width: int, channels: int = COLOURS) -> None:
+        """Build it for tokens of ``width`` channels, from maps of ``channels``."""
         super().__init__()
-        self.proj = nn.Conv2d(3, width, PATCH, stride=PATCH)
+        self.proj = nn.Conv2d(channels, width, PATCH, stride=PATCH)
+
+    def forward(self, maps: Tensor) -> Tensor:
+        """Return (B, h w, D) tokens, row by row, of (B, channels, H, W) maps."""
+        tokens: Tensor = self.proj(maps.to(self.proj.weight.dtype))
+        return tokens.flatten(2).transpose(1, 2)
+
+
+class ImageEmbedding(PatchEmbedding):
+    """A token for each patch of an image, whose colours are normalised first."""
 
     def forward(self, images: Tensor) -> Tensor:
         """Return (B, h w, D) tokens, row by row, of (B, 3, H, W) images in [0, 1]."""
-        maps: Tensor = self.proj(normalise(images).to(self.proj.weight.dtype))
-        return maps.flatten(2).transpose(1, 2)
+        return super().forward(normalise(images))
 
 
 def normalise(images: Tensor) -> Tensor:

@@ -45,11 +45,13 @@ class Layout(NamedTuple):
     Attributes:
         num_frames: N of a window.
         grid: rows and columns of a frame's patches.
-        rotation: of the T = 5 + rows columns tokens of a frame.
+        positions: (T, 2) of the T = 5 + rows columns tokens of a frame.
+        rotation: for these positions, in the decoder and the heads' decoders.
     """
 
     num_frames: int
     grid: tuple[int, int]
+    positions: Tensor
     rotation: Rotation
 
     def of_frames(self, tokens: Tensor) -> Tensor:
@@ -107,7 +109,7 @@ class Trunk(nn.Module):
         grid = images.shape[-2] // PATCH, images.shape[-1] // PATCH
         positions = grid_positions(*grid, NUM_SPECIAL, device=images.device)
         channels = self.config.encoder.width // self.config.num_heads
-        return Layout(images.shape[1], grid, make_rotation(positions, channels))
+        return Layout(images.shape[1], grid, positions, make_rotation(positions, channels))
 
     def encode(self, images: Tensor) -> Tensor:
         """Return (B N, P, D) normalised patch tokens of (B, N, 3, H, W) images.
