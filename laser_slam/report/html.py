@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
@@ -86,12 +86,13 @@ class Pictures:
 
     Attributes:
         pictures: in this order.
-        columns: 1 or 2.
+        layout: of a wide page: ``one`` below the other, ``two`` in a row, or the first as
+            ``lead``, the others smaller beside it.
     """
 
     kind: ClassVar[str] = "pictures"
     pictures: Sequence[Picture]
-    columns: int = 1
+    layout: Literal["one", "two", "lead"] = "one"
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class Bar:
 
     Attributes:
         label: its name.
-        share: of the whole, in [0, 1].
+        share: of the longest bar, in [0, 1].
         texts: numbers beside the bar.
     """
 

@@ -11,13 +11,14 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Role = Literal["truth", "without", "estimate", "accepted", "rejected", "start", "end"]
+Role = Literal["truth", "without", "estimate", "accepted", "rejected", "band", "start", "end"]
 
 BOX = 1000  # units of the drawing, on both sides; the page stretches them
 _WIDE, _TALL = 2.4, 0.8  # limits of a plan's width over its height
 _MARGIN = 0.05  # around a plan, in extents
 _ASPECT = 2.6  # width over height of a chart that is no plan
 _LEAST = 1e-12
+_DECIMALS = 7
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,13 @@ class Axis:
         label: with the unit.
         is_percent: whether values are shares, shown as percent.
         has_zero: whether zero must be in view.
+        is_whole: whether only whole numbers mean something.
     """
 
     label: str
     is_percent: bool = False
     has_zero: bool = False
+    is_whole: bool = False
 
 
 @dataclass(frozen=True)
@@ -183,7 +186,9 @@ def _limits(values: Sequence[Array], has_zero: bool = False) -> tuple[float, flo
 
 def _ticks(axis: Axis, limits: tuple[float, float], num: int) -> Iterator[Tick]:
     low, high = limits
-    values = MaxNLocator(nbins=num, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+    steps = [1, 2, 5, 10] if axis.is_whole else [1, 2, 2.5, 5, 10]
+    locator = MaxNLocator(nbins=num, steps=steps, integer=axis.is_whole)
+    values = locator.tick_values(low, high)
     step = float(values[1] - values[0]) if len(values) > 1 else 1.0
     for value in values:
         if low - 1e-9 * (high - low) <= value <= high + 1e-9 * (high - low):
@@ -194,20 +199,18 @@ def _ticks(axis: Axis, limits: tuple[float, float], num: int) -> Iterator[Tick]:
 def _tick_text(value: float, step: float, *, is_percent: bool) -> str:
     """Write a round number with the decimals that the step asks for.
 
-    >>> _tick_text(0.25, 0.05, is_percent=False), _tick_text(1500.0, 500, is_percent=False)
-    ('0.25', '1,500')
-    >>> _tick_text(0.025, 0.025, is_percent=True), _tick_text(-0.0, 1, is_percent=False)
+    >>> _tick_text(0.25, 0.05, is_percent=False), _tick_text(-1500.0, 500, is_percent=False)
+    ('0.25', '−1,500')
+    >>> _tick_text(0.025, 0.025, is_percent=True), _tick_text(-1e-17, 1, is_percent=False)
     ('2.5 %', '0')
     """
     if is_percent:
         value, step = 100 * value, 100 * step
-    decimals = next((d for d in range(8) if abs(step - round(step, d)) < 1e-6 * step), 8)
-    text = f"{value + 0.0:,.{decimals}f}"
-    if decimals == 8:
-        text = f"{value:.2g}"
-    return f"{text.removeprefix('-') if float(text.replace(',', '')) == 0 else text}" + (
-        " %" if is_percent else ""
-    )
+    decimals = next((d for d in range(_DECIMALS) if round(step, d) > 0.999 * step), None)
+    if decimals is not None and abs(round(step, decimals) - step) > 1e-6 * step:
+        decimals += 1  # 2.5, 0.25, ...
+    text = f"{value:.3g}" if decimals is None else f"{round(value, decimals) + 0.0:,.{decimals}f}"
+    return text.replace("-", "−") + (" %" if is_percent else "")
 
 
 def _stroke(line: Line, limits: tuple[tuple[float, float], tuple[float, float]]) -> Stroke:

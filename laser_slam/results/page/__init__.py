@@ -34,7 +34,7 @@ def write_report_page(folder: Path) -> None:
         title=str(look(report, "sequence.name") or folder.resolve().name),
         facts=facts(report),
         headline=headline(report),
-        warnings=group_warnings([str(each) for each in look(report, "warnings") or []]),
+        warnings=group_warnings(report),
         sections=[
             world_map(report, folder),
             trajectory(report, folder),

@@ -44,7 +44,7 @@ def loops(report: Report, folder: Path) -> Section:
     title = "Similarity of the keyframes' descriptors"
     alt = f"{title}: each keyframe against each other, loops ringed"
     if similarity := find_picture(folder, "similarity", title, alt):
-        blocks.append(Pictures([similarity], columns=2))
+        blocks.append(Pictures([similarity], "two"))
     return Section("loops", "Loops", blocks)
 
 
@@ -116,7 +116,6 @@ _HEAD = (
     "heading",
     "overlap",
     "sigmas apart",
-    "measured by",
 )
 
 
@@ -125,16 +124,17 @@ def _table(found: Sequence[Report]) -> Table:
     caption = f"{len(found)} candidates, closed ones first"
     if len(shown) < len(found):
         caption += f"; {len(shown)} are shown, all are in closures.json"
-    return Table(caption, _HEAD, [_cells(row) for row in shown], frozenset({2, 12}))
+    return Table(caption, _HEAD, [_cells(row) for row in shown], frozenset({2}))
 
 
 def _cells(row: Report) -> list[str]:
     is_accepted = look(row, "verdict") == ACCEPTED
-    heading = number(row, "heading_deg")
+    heading, source = number(row, "heading_deg"), look(row, "source")
+    by = f", by {source}" if source else ""
     return [
         f"{plain(look(row, 'frame_a'))} – {plain(look(row, 'frame_b'))}",
         f"{plain(look(row, 'window_a'))} – {plain(look(row, 'window_b'))}",
-        "closed" if is_accepted else f"rejected: {plain(look(row, 'verdict'))}",
+        f"closed{by}" if is_accepted else f"rejected: {plain(look(row, 'verdict'))}",
         say(number(row, "similarity"), 2),
         count(number(row, "image_inliers")),
         count(number(row, "inliers")),
@@ -144,5 +144,4 @@ def _cells(row: Report) -> list[str]:
         "" if heading is None else f"{heading:.0f}°",
         percent(number(row, "overlap"), 2),
         say(number(row, "disagreement"), 2),
-        str(look(row, "source") or ""),
     ]

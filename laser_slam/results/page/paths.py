@@ -27,6 +27,7 @@ _VIEWS = (
     ("map_bird", "Oblique"),
     ("map_driver", "From the driver's seat"),
 )
+_MAX_LINKS = 60  # rejected ones; more would hide the path
 _UNFILTERED = "_unfiltered"
 _DRAWN = (  # for a report of an older version
     ("trajectory", "Trajectory from above"),
@@ -53,12 +54,10 @@ def world_map(report: Report, folder: Path) -> Section:
             find_picture(folder, name + _UNFILTERED, f"{title}, unfiltered", raw),
         ]
         shown[name] = [picture for picture in found if picture is not None]
-    blocks: list[Block] = [Pictures(each, 2) for each in shown.values() if len(each) == 2]
+    blocks: list[Block] = [Pictures(each, "two") for each in shown.values() if len(each) == 2]
     alone = [each[0] for each in shown.values() if len(each) == 1]
-    if len(alone) % 2:  # the first one large, the others in pairs
-        blocks.append(Pictures(alone[:1]))
-    if len(alone) > 1:
-        blocks.append(Pictures(alone[len(alone) % 2 :], 2))
+    if alone:
+        blocks.append(Pictures(alone, "lead" if len(alone) > 2 else "two"))
     if not blocks:
         blocks.append(Text("No pictures of the map were drawn."))
     return Section("map", "Map", blocks)
@@ -154,7 +153,8 @@ def _links(report: Report) -> list[Line]:
             ends = np.stack([column(chosen, "frame_a"), column(chosen, "frame_b")], axis=1)
             lines_x, lines_z = (_with_gaps(np.interp(ends, frames, axis)) for axis in (x, z))
             text = f"{label} ({len(chosen)})"
-            out.append(Line(text, role, lines_x, lines_z, is_marked=True))
+            is_joined = len(chosen) <= _MAX_LINKS or role == "accepted"
+            out.append(Line(text, role, lines_x, lines_z, is_marked=True, is_joined=is_joined))
     return out
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -21,12 +21,12 @@ from laser_slam.results.page.reading import (
     flatten,
     look,
     number,
-    percent,
     plain,
     say,
 )
 
 _MAX_WARNINGS = 300
+_MAX_GROUPS = 12  # at the top of the page
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 # What the page shows in full elsewhere, or is no counter.
 _SERIES = ("records", "sigmas", "refused", "trajectory_without", "windows", "bridged")
@@ -51,19 +51,28 @@ def facts(report: Report) -> list[str]:
     return [text for text in found if text]
 
 
-def group_warnings(warnings: Sequence[str]) -> list[str]:
+def group_warnings(report: Report) -> list[str]:
     """Say warnings that differ in their numbers only once, with how many there are.
 
-    >>> group_warnings(["frame 4 cannot be read", "frame 5 cannot be read", "the map is empty"])
+    >>> warnings = ["frame 4 cannot be read", "frame 5 cannot be read", "the map is empty"]
+    >>> group_warnings({"warnings": warnings})
     ['frame 4 cannot be read (and 1 more like it)', 'the map is empty']
     """
     alike: defaultdict[str, list[str]] = defaultdict(list)
-    for warning in warnings:
+    for warning in _warnings(report):
         alike[_NUMBER.sub("N", warning)].append(warning)
-    return [
+    groups = [
         each[0] + (f" (and {count(len(each) - 1)} more like it)" if len(each) > 1 else "")
         for each in alike.values()
     ]
+    more = len(groups) - _MAX_GROUPS
+    return groups[:_MAX_GROUPS] + (
+        [f"{count(more)} more below, in the details"] if more > 0 else []
+    )
+
+
+def _warnings(report: Report) -> list[str]:
+    return [str(warning) for warning in look(report, "warnings") or []]
 
 
 def time_by_stage(report: Report) -> Section:
@@ -74,10 +83,10 @@ def time_by_stage(report: Report) -> Section:
     bars = [
         Bar(
             stage,
-            wall[stage] / total if total else 0.0,
+            wall[stage] / max(wall[stages[0]], 1e-9),
             [
                 f"{wall[stage]:,.1f}",
-                percent(wall[stage] / total, 2) if total else "",
+                f"{100 * wall[stage] / max(total, 1e-9):.1f} %",
                 f"{number(report, f'seconds.cpu.{stage}') or 0:,.1f}",
             ],
         )
@@ -87,7 +96,7 @@ def time_by_stage(report: Report) -> Section:
         return Section("time", "Time", [])
     cpu = say(number(report, "seconds.cpu_in_all"))
     caption = f"{say(total)} s in all" + (f", {cpu} s of processor time" if cpu else "")
-    head = ["stage", "share of the wall time", "s", "share", "processor s"]
+    head = ["stage", "wall time", "s", "share", "processor s"]
     return Section("time", "Time", [Bars(caption, head, bars)])
 
 
@@ -107,10 +116,10 @@ def settings(report: Report) -> Section:
     caption = f"Settings that differ from the defaults of laser-slam {__version__}"
     blocks: list[Block] = []
     if changed:
-        blocks.append(Table(caption, head, changed, frozenset({3})))
+        blocks.append(Table(caption, head, changed, frozenset({1, 2, 3})))
     else:
         blocks.append(Text("All settings are the defaults."))
-    every = Table("All settings", head, rows, frozenset({3}))
+    every = Table("All settings", head, rows, frozenset({1, 2, 3}))
     blocks.append(Fold(f"All {len(rows)} settings", [every]))
     return Section("settings", "Settings", blocks)
 
@@ -129,7 +138,7 @@ def _descriptions(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[st
 
 def details(report: Report, folder: Path) -> Section:
     """Show calibration, counters, all warnings, versions and the files beside the page."""
-    blocks = [_calibration(report), _counters(report), *_warnings(report)]
+    blocks = [_calibration(report), _counters(report), *_all_warnings(report)]
     versions = [[name, plain(value)] for name, value in flatten(look(report, "versions") or {})]
     if versions:
         table = Table("Versions", ["package", "version"], versions, frozenset({1}))
@@ -178,9 +187,10 @@ def _without_series(part: Any) -> Any:
     return {**kept, **lengths}
 
 
-def _warnings(report: Report) -> list[Block]:
-    warnings = [str(warning) for warning in look(report, "warnings") or []]
-    if not warnings:
+def _all_warnings(report: Report) -> list[Block]:
+    """List what the top of the page has only summed up."""
+    warnings = _warnings(report)
+    if group_warnings(report) == warnings:
         return []
     shown = warnings[:_MAX_WARNINGS]
     more = len(warnings) - len(shown)

@@ -44,7 +44,7 @@ def windows(report: Report, folder: Path) -> Section:
                 ("layer_mismatch", "Depth of shared frames: difference to the window before"),
             )
         ]
-        blocks += [Pictures([p for p in drawn if p is not None], 2)] if any(drawn) else []
+        blocks += [Pictures([p for p in drawn if p is not None], "two")] if any(drawn) else []
     if look(report, "layers"):
         blocks.append(Text(_layers_in_words(report)))
     rows = records(report, "windows.records")
@@ -124,7 +124,7 @@ def _residuals(report: Report) -> Chart | None:
         f"{percent(float(np.nanmax(residual)), 2)} in the worst."
     )
     y_axis = Axis("share of the depth", is_percent=True, has_zero=True)
-    return line_chart(title, alt, lines, Axis("window"), y_axis)
+    return line_chart(title, alt, lines, Axis("window", is_whole=True), y_axis)
 
 
 def _layer_charts(report: Report) -> list[Chart]:
@@ -142,18 +142,22 @@ def _layer_charts(report: Report) -> list[Chart]:
             Line("with layer scales, first pass", "estimate", x, after, is_marked=True),
         ]
         y_axis = Axis("median difference", is_percent=True, has_zero=True)
-        out.append(line_chart(title, alt, lines, Axis("window"), y_axis))
+        out.append(line_chart(title, alt, lines, Axis("window", is_whole=True), y_axis))
     low, middle, high = (column(rows, f"scales.{name}") for name in ("p5", "p50", "p95"))
     if np.isfinite(middle).any():
         title = "Scales of the layers, by area"
         span = f"{say(float(np.nanmin(low)))} to {say(float(np.nanmax(high)))}"
         alt = f"{title}: 5 % and 95 % of the area lie within {span} over all windows."
         lines = [
-            Line("5 % and 95 %", "truth", x, low),
-            Line("", "truth", x, high),
+            Line("5 % and 95 %", "band", x, low),
+            Line("", "band", x, high),
             Line("median", "estimate", x, middle, is_marked=True),
         ]
-        out.append(line_chart(title, alt, lines, Axis("window"), Axis("factor on the depth")))
+        out.append(
+            line_chart(
+                title, alt, lines, Axis("window", is_whole=True), Axis("factor on the depth")
+            )
+        )
     return out
 
 
