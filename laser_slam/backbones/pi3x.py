@@ -44,9 +44,10 @@ class Pi3XBackbone(NetworkBackbone):
         return RELEASED
 
     def _load(self, weights: Path) -> Any:
-        from laser_slam.networks.pi3x import load_pi3x  # noqa: PLC0415
+        from laser_slam.networks.pi3x import Pi3XConfig, load_pi3x  # noqa: PLC0415
 
-        network = load_pi3x(str(weights), self._placement.weights_dtype)
+        shape = Pi3XConfig(takes_conditions=self._is_told)  # a quarter of the weights is for them
+        network = load_pi3x(str(weights), self._placement.weights_dtype, shape)
         network.chunk = self._config.chunk
         return network
 

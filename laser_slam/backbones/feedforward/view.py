@@ -89,6 +89,7 @@ def _from_first(poses: Array) -> Array:
     out = np.array(poses)
     out[:, :3, :3] = rotation.T @ poses[:, :3, :3]
     out[:, :3, 3] = (poses[:, :3, 3] - centre) @ rotation
+    out[0] = np.eye(4)  # to the last bit
     return out
 
 
