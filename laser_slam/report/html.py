@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import ClassVar, Literal
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -220,11 +221,15 @@ class Page:
 
 def render_page(page: Page) -> str:
     """Return the page as one HTML file: no scripts, nothing from the network, all text escaped."""
-    environment = Environment(
+    return _environment().get_template("page.html.j2").render(page=page)
+
+
+@cache
+def _environment() -> Environment:
+    return Environment(
         loader=PackageLoader("laser_slam.report"),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    return environment.get_template("page.html.j2").render(page=page)

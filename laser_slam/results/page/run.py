@@ -77,7 +77,8 @@ def _warnings(report: Report) -> list[str]:
 
 def time_by_stage(report: Report) -> Section:
     """Show where the time went, longest first."""
-    wall = look(report, "seconds.wall") or {}
+    found = look(report, "seconds.wall") or {}
+    wall = {stage: s for stage in found if (s := number(found, stage)) is not None}
     total = sum(wall.values())
     stages = sorted(wall, key=lambda stage: -wall[stage])
     bars = [
