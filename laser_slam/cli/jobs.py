@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -42,17 +42,38 @@ class MapOptions(RunOptions):
         print_summary(results.report, results.folder)
 
 
+EngineOption = Annotated[
+    Literal["local", "ray"],
+    typer.Option("--engine", help="Who predicts: this process, or workers of Ray."),
+]
+AddressOption = Annotated[
+    str | None, typer.Option("--address", help="Ray cluster: auto, ray://HOST:10001; else local.")
+]
+WorkersOption = Annotated[
+    int | None, typer.Option("--workers", min=1, help="Of Ray; default: one for each GPU.")
+]
+CoresOption = Annotated[int | None, typer.Option("--cores", min=1, help="Of each worker.")]
+
+
 @dataclass(frozen=True)
 class PredictOptions(RunOptions):
     """Options of predicting alone."""
 
+    engine: EngineOption = "local"
+    address: AddressOption = None
+    workers: WorkersOption = None
+    cores: CoresOption = None
+
     def work(self, dataset: Dataset, config: Config) -> None:
         """Predict the windows of the data set."""
         from laser_slam.console import progress_display
-        from laser_slam.predicting import Job
+        from laser_slam.predicting import Fleet, Job
 
+        fleet = None
+        if self.engine == "ray":
+            fleet = Fleet(self.address, self.workers, self.cores)
         with progress_display(quiet=self.quiet) as on_progress:
-            job = Job(dataset, config, self.out, on_progress=on_progress)
+            job = Job(dataset, config, self.out, fleet=fleet, on_progress=on_progress)
             try:
                 num = job.run()
             except KeyboardInterrupt as error:

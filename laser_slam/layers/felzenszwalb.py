@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.config import SegmentationConfig
+from laser_slam.dependencies import num_threads
 from laser_slam.layers import felzenszwalb_kernels as kernels
 from laser_slam.layers.edge_kernels import NUM_DIRECTIONS, weigh_edges
 from laser_slam.layers.merging import merge_regions
@@ -97,20 +97,13 @@ def _gaussian(image: Array, radius: int, sigma: float) -> Array:
     return np.asarray(cv2.GaussianBlur(image, size, sigma, borderType=cv2.BORDER_REFLECT))
 
 
-def _num_cores() -> int:
-    """Return how many cores this process may use: more threads would share their caches."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 class FelzenszwalbSegmenter:
     """Segment each depth map on its own, frames in parallel."""
 
     def __init__(self, config: SegmentationConfig) -> None:
         self._config = config
         self._local = threading.local()
-        self._pool = ThreadPoolExecutor(_num_cores(), thread_name_prefix="segmentation")
+        self._pool = ThreadPoolExecutor(num_threads(), thread_name_prefix="segmentation")
 
     def segment(self, window: Prediction, colors: Image) -> NDArray[np.uint16]:
         """Label the frames by depth alone; see ``Segmenter``."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import closing
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -40,6 +41,9 @@ class BackboneSource:
 
     One thread reads, chooses keyframes and cuts windows, another predicts and stores: the backbone
     waits neither for the disk nor for the rest of the run.
+
+    Attributes:
+        files: of the windows.
     """
 
     def __init__(
@@ -64,7 +68,7 @@ class BackboneSource:
         self._dataset = dataset
         self._config = config
         self._folder = folder
-        self._files = WindowFiles(folder)
+        self.files = WindowFiles(folder)
         self._clock = clock
         self._on_progress = on_progress
         self._size = backbone.image_size(dataset.info.size)
@@ -89,6 +93,16 @@ class BackboneSource:
         else:
             self._manifest.save(self._folder)
 
+    def start_afresh_after(self, num_windows: int) -> None:
+        """Note that the backbone forgets after so many windows, which makes other predictions."""
+        identity = {**self._manifest.identity, "stretch": num_windows}
+        self._manifest = replace(self._manifest, identity=identity)
+
+    @property
+    def is_complete(self) -> bool:
+        """Tell whether all windows have had their files before."""
+        return self._stored is not None
+
     def calibrate(self) -> None:
         """Learn how the camera projects, from the first keyframes; rectify images by it."""
         path = self._folder / CALIBRATION
@@ -107,34 +121,42 @@ class BackboneSource:
         """Predict the windows, or read what was said of them before the run was broken off."""
         if self._stored is not None:
             self.input = FrameLog(*load_frames(self._folder))
-            yield from load_windows(self._files, self._stored, self._clock)
+            yield from load_windows(self.files, self._stored, self._clock)
             return
         frames = []
         with closing(ahead(self._predicted(), self._clock.idle)) as predicted:
             for prediction, colors in predicted:
                 frames.append(prediction.frames.tolist())
                 yield prediction, colors
+        self.finish(frames)
+
+    def finish(self, frames: list[list[int]]) -> None:
+        """Note that all windows have their files.
+
+        Args:
+            frames: indices of each window, in order.
+        """
         save_frames(self._folder, self.input.times_s, self.input.unreadable)
         self._manifest.with_windows(frames).save(self._folder)
 
     def _predicted(self) -> Iterator[tuple[Prediction, Image]]:
-        with closing(ahead(self._cut(), self._clock.idle)) as windows:
+        with closing(ahead(self.cut(), self._clock.idle)) as windows:
             for window in windows:
                 yield self._predict(window)
 
     def _predict(self, window: Window) -> tuple[Prediction, Image]:
-        if not self.remembers and self._files.has(window.index):
+        if not self.remembers and self.files.has(window.index):
             with self._clock.stage("load"):
-                return self._files.load(window.index, window.frames)
+                return self.files.load(window.index, window.frames)
         with self._clock.stage("predict"):
             prediction = self.backbone.predict(
                 window.images, window.frames, self.rectifier.intrinsics
             )
         with self._clock.stage("store"):
             colors = reduce_images(window.images, prediction.depth.shape[1:])
-            return self._files.save(window.index, prediction, colors)
+            return self.files.save(window.index, prediction, colors)
 
-    def _cut(self) -> Iterator[Window]:
+    def cut(self) -> Generator[Window, None, None]:
         """Read the frames, choose keyframes, cut windows: lazily, one window at a time."""
         info, config, clock = self._dataset.info, self._config.windows, self._clock
         with closing(self._dataset.frames()) as stream:

@@ -14,6 +14,7 @@ from laser_slam.store.windows import (
     WindowFiles,
     load_layers,
     load_prediction,
+    pack_window,
     save_layers,
     save_prediction,
 )
@@ -35,6 +36,7 @@ __all__ = [
     "name_differences",
     "new_run_folder",
     "open_run_folder",
+    "pack_window",
     "save_layers",
     "save_prediction",
     "write_text",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -18,6 +17,7 @@ from laser_slam.backbones.classical.reconstruction import Reconstruction, Solver
 from laser_slam.backbones.classical.tracking import FrameTracks, Tracker
 from laser_slam.camera import guess_intrinsics
 from laser_slam.config import BackboneConfig
+from laser_slam.dependencies import num_threads
 from laser_slam.sim3 import Array
 from laser_slam.types import Calibration, Image, Prediction, Window
 
@@ -44,7 +44,7 @@ class ClassicalBackbone:
 
     def __init__(self, config: BackboneConfig) -> None:
         self._config = config.classical
-        self._workers = ThreadPoolExecutor(os.cpu_count() or 1)
+        self._workers = ThreadPoolExecutor(num_threads())
         self._longest = 0  # frames of a window, for which there is memory
         self._tracker = Tracker(self._config, memory=0)
         self._poses: Poses = {}  # in the axes and the unit of the last window's solution

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -17,6 +16,7 @@ from laser_slam.backbones.simulated.pieces import Pieces
 from laser_slam.backbones.simulated.poses import distort_poses
 from laser_slam.backbones.simulated.truth import STRIDE, TrueDepth, Truth, WindowTruth
 from laser_slam.config import BackboneConfig
+from laser_slam.dependencies import num_threads
 from laser_slam.types import (
     NO_DISTORTION,
     Calibration,
@@ -71,7 +71,7 @@ class SimulatedBackbone:
         self._config = config.simulated
         size = (1, 1) if info is None else self.image_size(info.size)
         self._truth = Truth(info, true_depth, size)
-        self._workers = ThreadPoolExecutor(os.cpu_count() or 1)
+        self._workers = ThreadPoolExecutor(num_threads())
         self._has_warned = False
         partition = Draws(self._config.seed, 0, 1.0).common(Purpose.PARTITION)
         samples, K = self._truth.samples, self._truth.intrinsics

@@ -1,0 +1,317 @@
+"""Windows spread over many GPUs or machines: each is predicted by whoever is free."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.backbones import is_on_cpu, make_backbone
+from laser_slam.backbones.base import Backbone
+from laser_slam.config import BackboneConfig
+from laser_slam.dependencies import import_ray, num_threads
+from laser_slam.errors import ConfigError, LaserSlamError
+from laser_slam.predicting.backbone_source import BackboneSource
+from laser_slam.rectification import reduce_images
+from laser_slam.store import pack_window
+from laser_slam.types import Window
+
+# Windows in a row that go to one worker, where the backbone remembers: it starts afresh with each
+# stretch, whoever does it, so that the outcome does not depend on how many workers there are.
+STRETCH = 8
+CORES = 2  # of a worker without GPU
+MAX_TRIES = 3  # workers that may be lost over the same windows
+REACH_S = 10.0
+START_S = 600.0  # a worker may read gigabytes of weights
+QUEUED = 2  # stretches per worker, so that none waits for the next
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Which workers there are to be.
+
+    Attributes:
+        address: of a Ray cluster, such as ``auto`` or ``ray://head:10001``; None: this machine.
+        num_workers: None: one for each GPU, or as many as the cores allow.
+            cores: that each worker gets; None: all that there are for each GPU, without GPUs 2.
+    """
+
+    address: str | None = None
+    num_workers: int | None = None
+    cores: int | None = None
+
+
+@dataclass
+class _Task:
+    """Windows in a row, until their predictions are stored."""
+
+    windows: list[Window]
+    num_tries: int = 0
+
+
+class Worker:
+    """What runs in a process of its own, perhaps on another machine."""
+
+    def __init__(self, config: BackboneConfig) -> None:
+        cv2.setNumThreads(num_threads())
+        self._config = config
+
+    @cached_property
+    def backbone(self) -> Backbone:
+        """The source of depth and poses, made when it is first needed."""
+        return make_backbone(self._config)
+
+    def identity(self) -> dict[str, Any]:
+        """Return what its predictions depend on beside the images."""
+        return self.backbone.identity()
+
+    def process(self) -> int:
+        """Return the number of the process that it runs in."""
+        return os.getpid()
+
+    def predict(self, windows: list[Window], intrinsics: NDArray[np.float64] | None) -> list[bytes]:
+        """Predict windows in a row, as if there were no others; return their files' contents."""
+        if self.backbone.remembers:
+            del self.backbone
+        files = []
+        for window in windows:
+            prediction = self.backbone.predict(window.images, window.frames, intrinsics)
+            colors = reduce_images(window.images, prediction.depth.shape[1:])
+            files.append(pack_window(prediction, colors))
+        return files
+
+
+class Crew:
+    """The workers of a fleet, and what each is doing.
+
+    Attributes:
+        workers: handles of the processes.
+    """
+
+    def __init__(self, fleet: Fleet, config: BackboneConfig, identity: dict[str, Any]) -> None:
+        """Start the workers, in Ray if it runs in this process already.
+
+        Args:
+            fleet: which.
+            config: of the backbone.
+            identity: that the backbone must have everywhere.
+
+        Raises:
+            DependencyError: Ray is not installed.
+            ConfigError: there is no such cluster, or it has not what the workers need.
+        """
+        self._ray = import_ray()
+        self._config = config
+        self._identity = identity
+        self._is_guest = self._ray.is_initialized()
+        self._tasks: dict[Any, tuple[Any, _Task]] = {}  # what comes of it -> worker, task
+        self.workers: list[Any] = []
+        if not self._is_guest:
+            _connect(self._ray, fleet.address)
+        self._options, num = _needs(self._ray.cluster_resources(), fleet, config)
+        self.workers += [self._start() for _ in range(num)]
+
+    def __enter__(self) -> Crew:
+        """Wait for the workers; those that would predict otherwise are refused."""
+        try:
+            for worker in self.workers:
+                self._check(worker)
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let all workers go."""
+        for worker in self.workers:
+            self._ray.kill(worker)
+        if not self._is_guest:
+            self._ray.shutdown()
+
+    def predict(
+        self, stretches: Iterable[list[Window]], intrinsics: NDArray[np.float64] | None
+    ) -> Iterator[tuple[list[Window], list[bytes]]]:
+        """Give windows with their files' contents, in the order in which they are done.
+
+        What a lost worker had is given to another, which takes its place.
+
+        Args:
+            stretches: windows in a row; a few more are taken than there are workers.
+            intrinsics: (3, 3) in pixels of the images; None: unknown.
+
+        Raises:
+            LaserSlamError: a backbone refused, or workers are lost again and again.
+        """
+        for stretch in stretches:
+            self._give(_Task(stretch), intrinsics)
+            while len(self._tasks) >= QUEUED * len(self.workers):
+                yield from self._collect(intrinsics)
+        while self._tasks:
+            yield from self._collect(intrinsics)
+
+    def _start(self) -> Any:
+        return self._ray.remote(Worker).options(**self._options).remote(self._config)
+
+    def _check(self, worker: Any) -> None:
+        """Wait for a worker, and refuse one that would predict otherwise than the others."""
+        try:
+            found = self._ray.get(worker.identity.remote(), timeout=START_S)
+        except self._ray.exceptions.RayError as error:
+            raise _cause(error) from error
+        if found != self._identity:
+            raise ConfigError(
+                f"a worker has another backbone ({found}) than this machine ({self._identity}); "
+                "give all machines the same weights and settings"
+            )
+
+    def _give(self, task: _Task, intrinsics: NDArray[np.float64] | None) -> None:
+        load = {id(worker): 0 for worker in self.workers}
+        for worker, _ in self._tasks.values():
+            load[id(worker)] = load.get(id(worker), 0) + 1
+        worker = min(self.workers, key=lambda each: load[id(each)])
+        self._tasks[worker.predict.remote(task.windows, intrinsics)] = (worker, task)
+
+    def _collect(
+        self, intrinsics: NDArray[np.float64] | None
+    ) -> Iterator[tuple[list[Window], list[bytes]]]:
+        """Wait until something is done, or lost."""
+        done, _ = self._ray.wait(list(self._tasks), num_returns=1)
+        for each in done:
+            worker, task = self._tasks.pop(each)
+            try:
+                files = self._ray.get(each)
+            except self._ray.exceptions.ActorDiedError as error:
+                self._replace(worker, task, error)
+                self._give(task, intrinsics)
+            except self._ray.exceptions.RayError as error:
+                raise _cause(error) from error
+            else:
+                yield task.windows, files
+
+    def _replace(self, lost: Any, task: _Task, error: Exception) -> None:
+        task.num_tries += 1
+        first, last = task.windows[0].index, task.windows[-1].index
+        if task.num_tries == MAX_TRIES:
+            raise LaserSlamError(
+                f"{MAX_TRIES} workers were lost over windows {first} to {last} ({_line(error)}); "
+                "see Ray's log; give each worker more memory, or lower windows.size"
+            ) from error
+        logger.warning("a worker was lost; windows %d to %d are done again", first, last)
+        if lost in self.workers:
+            self.workers.remove(lost)
+            self.workers.append(self._start())
+            self._check(self.workers[-1])
+
+
+def spread(source: BackboneSource, crew: Crew) -> Iterator[list[Window]]:
+    """Predict what is missing of a source's windows; the same files, whoever makes them.
+
+    Args:
+        source: calibrated; what it has files of is left as it is.
+        crew: of workers.
+
+    Yields:
+        Windows in a row whose files are there now, those left as they were included.
+    """
+    frames: dict[int, list[int]] = {}
+    waiting: list[list[Window]] = []
+
+    def missing() -> Iterator[list[Window]]:
+        with closing(source.cut()) as windows:
+            for stretch in _stretches(windows, STRETCH if source.remembers else 1):
+                frames.update({window.index: window.frames.tolist() for window in stretch})
+                if all(source.files.has(window.index) for window in stretch):
+                    waiting.append(stretch)
+                else:
+                    yield stretch
+
+    for stretch, files in crew.predict(missing(), source.rectifier.intrinsics):
+        for window, content in zip(stretch, files, strict=True):
+            source.files.write(window.index, content)
+        yield from [*waiting, stretch]
+        waiting.clear()
+    yield from waiting
+    source.finish([frames[index] for index in sorted(frames)])
+
+
+def _stretches(windows: Iterable[Window], length: int) -> Iterator[list[Window]]:
+    stretch: list[Window] = []
+    for window in windows:
+        stretch.append(window)
+        if len(stretch) == length:
+            yield stretch
+            stretch = []
+    if stretch:
+        yield stretch
+
+
+def _connect(ray: Any, address: str | None) -> None:
+    """Join a cluster, or start one of this machine alone."""
+    _refuse_unreachable(address)
+    quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
+    try:
+        if address is None:
+            ray.init(include_dashboard=False, **quiet)
+        else:
+            ray.init(address=address, **quiet)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        where = "on this machine" if address is None else f"at {address}"
+        raise ConfigError(
+            f"--address: no Ray cluster {where} ({_line(error)}); start one with 'ray start --head'"
+        ) from error
+
+
+def _refuse_unreachable(address: str | None) -> None:
+    """Say at once what Ray finds out after many minutes."""
+    host, _, port = (address or "").removeprefix("ray://").rpartition(":")
+    if not port.isdecimal():
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=REACH_S).close()
+    except (OSError, OverflowError) as error:
+        raise ConfigError(
+            f"--address: nothing answers at {address} ({error}); start a cluster there with "
+            "'ray start --head'"
+        ) from error
+
+
+def _needs(
+    has: dict[str, float], fleet: Fleet, config: BackboneConfig
+) -> tuple[dict[str, float], int]:
+    """Return what Ray is asked for each worker, and how many there are to be."""
+    cores, gpus = int(has.get("CPU", 1)), int(has.get("GPU", 0))
+    if gpus and not is_on_cpu(config):
+        needs = {"num_gpus": 1, "num_cpus": fleet.cores or max(1, cores // gpus)}
+        num = fleet.num_workers or gpus
+    else:
+        needs = {"num_gpus": 0, "num_cpus": min(fleet.cores or CORES, cores)}
+        num = fleet.num_workers or max(1, cores // int(needs["num_cpus"]))
+    if num * needs["num_cpus"] > cores or num * needs["num_gpus"] > gpus:
+        raise ConfigError(
+            f"{num} workers of {needs['num_cpus']} cores and {needs['num_gpus']} GPUs; there are "
+            f"{cores} cores and {gpus} GPUs: lower --workers or --cores"
+        )
+    return {**needs, "max_restarts": 0}, num
+
+
+def _cause(error: Exception) -> Exception:
+    """Return what went wrong in a worker: our own errors as they are."""
+    cause = getattr(error, "cause", None)
+    if isinstance(cause, LaserSlamError):
+        return cause
+    return LaserSlamError(f"a worker failed: {_line(error)}; see Ray's log")
+
+
+def _line(error: Exception) -> str:
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    return lines[-1].strip()[:200] if lines else type(error).__name__
