@@ -75,7 +75,8 @@ def test_two_workers_leave_what_one_process_leaves(tmp_path: Path, alone: dict[s
     assert work.run() == len(alone) > 6
     assert files_of(tmp_path / "run") == alone
     assert max(seen) == NUM_FRAMES
-    assert len(seen) == len(alone)
+    assert seen[0] == 0
+    assert len(seen) == 1 + len(alone)
     prediction, _ = load_prediction(tmp_path / "run" / "windows" / "000003.npz")
     assert prediction.confidence.any()
 

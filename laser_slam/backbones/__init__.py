@@ -24,6 +24,7 @@ BACKBONES = {
     "depth_anything3": "laser_slam.backbones.depth_anything3:DepthAnything3Backbone",
 }
 NETWORKS = {"pi3", "pi3x", "vggt"}  # whose memory is known
+REPLAY = "replay"  # in the settings: no backbone, but what one has predicted before
 WINDOW_SIZE = 20  # keyframes, where memory is no limit
 ON_CPU = {"classical", "simulated"}
 FROM_TRUTH = {"simulated"}  # these are made from what the data set knows, too
@@ -44,7 +45,7 @@ def make_backbone(
     Raises:
         ConfigError: no backbone has this name, or it simulates and the data set has no truth.
     """
-    chosen = import_named(BACKBONES, config.name, "backbone.name")
+    chosen = import_named(BACKBONES, config.name, "backbone.name", [REPLAY])
     truth = (info, true_depth) if config.name in FROM_TRUTH else ()
     backbone: Backbone = chosen(config, *truth)
     return backbone

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from laser_slam.backbones import make_backbone
+from laser_slam.backbones import REPLAY, make_backbone
 from laser_slam.backbones.base import Backbone
 from laser_slam.bookkeeping import Progress, StageClock
 from laser_slam.config import Config
 from laser_slam.datasets.base import Dataset
 from laser_slam.predicting.backbone_source import BackboneSource
 from laser_slam.predicting.replay_source import ReplaySource
-from laser_slam.predicting.settling import REPLAY
 from laser_slam.predicting.sources import Source
 
 

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from laser_slam.backbones import FROM_TRUTH, make_backbone
+from laser_slam.backbones import FROM_TRUTH, REPLAY, make_backbone
 from laser_slam.backbones.base import Backbone
 from laser_slam.bookkeeping import Progress, StageClock, no_progress, run_log
 from laser_slam.config import Config
@@ -15,7 +15,7 @@ from laser_slam.errors import ConfigError
 from laser_slam.export import write_tum
 from laser_slam.predicting.backbone_source import BackboneSource
 from laser_slam.predicting.fleet import STRETCH, Crew, Fleet, spread
-from laser_slam.predicting.settling import REPLAY, settle
+from laser_slam.predicting.settling import settle
 from laser_slam.store import link_latest, new_run_folder
 
 
@@ -99,5 +99,6 @@ class Job:
                 yield int(prediction.frames[-1])
             return
         with Crew(self._fleet, self._backbone, self.source.backbone.identity()) as crew:
+            self._on_progress("predicting", 0, self._dataset.info.num_frames)  # all are ready
             for stretch in spread(self.source, crew):
                 yield from (int(window.frames[-1]) for window in stretch)

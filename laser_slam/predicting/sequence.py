@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from laser_slam.backbones import REPLAY
 from laser_slam.errors import RunFolderError
 from laser_slam.predicting.manifest import load_frames, load_predictions, read_identity
-from laser_slam.predicting.settling import REPLAY
 from laser_slam.rescoring import read_trajectory
 from laser_slam.types import Frame, SequenceInfo, Trajectory
 

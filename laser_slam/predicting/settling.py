@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from laser_slam.backbones import choose_window_size
+from laser_slam.backbones import REPLAY, choose_window_size
 from laser_slam.config import Config, load_config
 from laser_slam.predicting.manifest import load_predictions
 from laser_slam.types import SequenceInfo
-
-REPLAY = "replay"  # in the settings: no backbone, but what one has predicted before
 
 
 def settle(config: Config, info: SequenceInfo, folder: Path | None) -> Config:
