@@ -156,6 +156,7 @@ def test_a_camera_listens_to_confident_pixels() -> None:
 def test_what_no_pinhole_camera_sees_has_none() -> None:
     points, confidence = cloud(4)
     assert fit_camera(points * np.float32([-1, 1, 1]), confidence, CENTRE) is None  # mirrored
+    assert fit_camera(points * np.float32([1e-3, 1, 1]), confidence, CENTRE) is None  # all ahead
     assert fit_camera(np.full_like(points, np.nan), confidence, CENTRE) is None
     assert fit_camera(points, np.zeros_like(confidence), CENTRE) is None
     assert fit_camera(points[:, :2, :2], confidence[:, :2, :2], (0.5, 0.5)) is None

@@ -114,6 +114,11 @@ def is_out_of_memory(error: RuntimeError) -> bool:
     )
 
 
+def is_overflow(error: RuntimeError) -> bool:
+    """Tell whether a matrix could not be decomposed, as happens to numbers that are not finite."""
+    return isinstance(error, torch.linalg.LinAlgError)
+
+
 def _devices() -> list[str]:
     """Return all devices, the best first."""
     cuda = [f"cuda:{index}" for index in range(torch.cuda.device_count())]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from laser_slam.backbones.feedforward.camera import take_calibration
 from laser_slam.backbones.feedforward.sizes import network_size
-from laser_slam.backbones.feedforward.view import View, to_prediction
+from laser_slam.backbones.feedforward.view import View, blind_view, to_prediction
 from laser_slam.config.networks import NetworkConfig
 from laser_slam.dependencies import import_torch
 from laser_slam.errors import ConfigError
@@ -136,11 +136,25 @@ class NetworkBackbone(ABC):
             with self._placement.computing():
                 view = self._view(network, self._placement.upload(pixels), intrinsics)
         except RuntimeError as error:
-            advice = self._memory_advice(error, pixels.shape, free_bytes)
-            if advice is None:
-                raise
-            raise ConfigError(advice) from error
+            view = self._after(error, pixels.shape, free_bytes)
         return to_prediction(view, frames)
+
+    def _after(self, error: RuntimeError, shape: tuple[int, ...], free_bytes: int) -> View:
+        """Say what to do where memory was too short for images of ``shape``.
+
+        Returns:
+            A view of nothing, where numbers have overflowed inside of the network.
+        """
+        from laser_slam.networks.memory import Job, advise  # noqa: PLC0415
+        from laser_slam.networks.placement import is_out_of_memory, is_overflow  # noqa: PLC0415
+
+        if is_overflow(error):
+            return blind_view((shape[0], shape[1], shape[2]))
+        if not is_out_of_memory(error):
+            raise error
+        job = Job(self.name, (shape[1], shape[2]), self._placement.dtype_name, self._config.chunk)
+        advice = advise(job, shape[0], free_bytes, f"backbone.{self.name}")
+        raise ConfigError(advice) from error
 
     @cached_property
     def _network(self) -> Any:
@@ -154,16 +168,3 @@ class NetworkBackbone(ABC):
         if self._weights is None:
             return hash_weights(self._given)
         return hash_file(self._weights)
-
-    def _memory_advice(
-        self, error: RuntimeError, shape: tuple[int, ...], free_bytes: int
-    ) -> str | None:
-        """Say what to do where memory was too short for images of ``shape``; else None."""
-        from laser_slam.networks.memory import Job, advise  # noqa: PLC0415
-        from laser_slam.networks.placement import is_out_of_memory  # noqa: PLC0415
-
-        if not is_out_of_memory(error):
-            return None
-        size = (shape[1], shape[2])
-        job = Job(self.name, size, self._placement.dtype_name, self._config.chunk)
-        return advise(job, shape[0], free_bytes, f"backbone.{self.name}")

@@ -16,6 +16,7 @@ Map = NDArray[np.float32]
 
 MAX_VOTES = 100_000  # pixels that fit the camera: more change nothing
 MIN_VOTES = 50
+FOCALS = (0.05, 50.0)  # in image sides: from wider to narrower than any lens
 
 
 def fit_camera(points: Map, confidence: Map, centre: tuple[float, float]) -> Array | None:
@@ -42,7 +43,9 @@ def fit_camera(points: Map, confidence: Map, centre: tuple[float, float]) -> Arr
         _proportion(np.asarray(pixels - middle, np.float64), voters[:, axis] / voters[:, 2], trust)
         for axis, (pixels, middle) in enumerate(zip((columns, rows), centre, strict=True))
     ]
-    if not min(per_px) > 0:
+    sides = (confidence.shape[2], confidence.shape[1])
+    spans = [slope * side for slope, side in zip(per_px, sides, strict=True)]
+    if not all(1 / FOCALS[1] < span < 1 / FOCALS[0] for span in spans):
         return None
     return intrinsics_matrix(1 / per_px[0], 1 / per_px[1], *centre)
 

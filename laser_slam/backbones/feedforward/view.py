@@ -67,6 +67,12 @@ def to_prediction(view: View, frames: NDArray[np.int64]) -> Prediction:
     )
 
 
+def blind_view(shape: tuple[int, int, int]) -> View:
+    """Return the view of (N, H, W) pixels that a network has no finite number for."""
+    nothing = np.full(shape, np.nan, np.float32)
+    return View(nothing, nothing, np.full((shape[0], 4, 4), np.nan), None)
+
+
 def inverted(rigid: Array) -> Array:
     """Return the inverses of (N, 4, 4) rigid transforms; not finite where they are not."""
     out = np.array(rigid)
