@@ -19,7 +19,7 @@ STAGES = [
 ]
 STAGES += ["viewer", "report", "layers", "places", "pose_graph"]
 COMPOSITION = ["closures", "slam", "bookkeeping", "results", "rescoring", "predicting", "pipeline"]
-COMPOSITION += ["exporting", "console", "cli"]
+COMPOSITION += ["exporting", "viewing", "console", "cli"]
 TORCH = {"torch", "safetensors"}  # no dependencies of a plain installation
 HEAVY = {"open3d", *TORCH, "gtsam", "numba", "cv2", "matplotlib", "scipy"}
 MODULES = sorted(PACKAGE.rglob("*.py"))

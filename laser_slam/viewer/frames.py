@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from laser_slam.camera import resize_intrinsics
 from laser_slam.config import FusionConfig, ViewerConfig
 from laser_slam.dependencies import import_rerun
+from laser_slam.sim3 import Sim3
 from laser_slam.types import Layers, Submap
 from laser_slam.viewer import arrangement as at
 from laser_slam.viewer.pictures import DEPTH_STEPS, encode_depth, encode_image, layer_classes
@@ -19,11 +20,11 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 _FRUSTUM = 0.35  # depth of the camera's frustum, in median depths
-_CAMERA = (255, 200, 60)
+_YELLOW = (255, 200, 60)
 
 
 class FrameLogger:
-    """Log frames in the frames of their windows, with which they move.
+    """Log one frame after the other.
 
     Args:
         stream: rerun's.
@@ -36,6 +37,7 @@ class FrameLogger:
         self._stream = stream
         self._config = config
         self._fusion = fusion
+        self._window_from_cam: Array = np.eye(4)  # of the last frame
 
     def log(
         self, submap: Submap, layers: Layers | None, rows: Rows, times_s: Array, unit: float
@@ -52,31 +54,34 @@ class FrameLogger:
         for row in rows:
             self._stream.set_time(at.FRAME, sequence=int(submap.prediction.frames[row]))
             self._stream.set_time(at.TIME, duration=float(times_s[row]))
-            self._log_camera(submap, int(row), unit, is_first=row == rows[0])
+            self._window_from_cam = submap.prediction.window_from_cam[row]
+            self.log_camera(submap.world_from_window)
+            if row == rows[0]:
+                self._log_lens(submap, int(row), unit)
             if self._config.image_width:
                 self._log_pictures(submap, int(row), unit)
                 self._log_layers(layers, int(row))
             if self._config.points_per_frame:
                 self._log_cloud(submap, int(row), unit)
 
-    def _log_camera(self, submap: Submap, row: int, unit: float, *, is_first: bool) -> None:
-        window_from_cam = submap.prediction.window_from_cam[row]
+    def log_camera(self, world_from_window: Sim3) -> None:
+        """Log where the last frame's camera is, now that its window is there."""
+        # In the world: rerun draws no camera below a transform that scales.
+        world_from_cam = world_from_window.apply_poses(self._window_from_cam)
         place = self._rerun.Transform3D(
-            mat3x3=window_from_cam[:3, :3],
-            translation=window_from_cam[:3, 3],
-            parent_frame=f"window {submap.index}",
+            mat3x3=world_from_cam[:3, :3], translation=world_from_cam[:3, 3]
         )
         self._stream.log(at.CAMERA, place)
-        if not is_first:
-            return
+
+    def _log_lens(self, submap: Submap, row: int, unit: float) -> None:
         size = submap.prediction.depth.shape[1:]
         width = self._config.image_width or size[1]
         shown = (max(1, round(size[0] * width / size[1])), width)
         lens = self._rerun.Pinhole(
             image_from_camera=resize_intrinsics(submap.prediction.intrinsics[row], size, shown),
             resolution=[shown[1], shown[0]],
-            image_plane_distance=_FRUSTUM * unit,
-            color=_CAMERA,
+            image_plane_distance=_FRUSTUM * unit * submap.world_from_window.scale,
+            color=_YELLOW,
         )
         self._stream.log(at.CAMERA, lens)
 

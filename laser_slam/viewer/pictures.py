@@ -65,7 +65,7 @@ def class_colors() -> list[tuple[int, str, tuple[int, int, int]]]:
     for i, level in enumerate(np.linspace(-1, 1, NUM_SCALES)):
         end = np.array([59, 117, 233] if level < 0 else [233, 66, 46])
         color = (1 - abs(level)) * np.array([205, 205, 205]) + abs(level) * end
-        red, green, blue = (int(round(float(value))) for value in color)
+        red, green, blue = (round(float(value)) for value in color)
         out.append((1 + i, f"x {np.exp(level * _REACH):.3f}", (red, green, blue)))
     return out
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +70,7 @@ class RerunViewer:
             center = submap.prediction.window_from_cam[row, :3, 3]
             self._centers[int(frames[row])] = submap.index, center
         self._set_time(int(frames[rows[0]]), float(times_s[rows[0]]))
+        self._places.append(submap.world_from_window)
         self._log_place(submap.index, submap.world_from_window)
         self._frames.log(submap, layers, rows, times_s, self._units[-1])
         self._log_plots(submap)
@@ -137,7 +137,6 @@ class RerunViewer:
             parent_frame=f"tf#/{at.WORLD}",
         )
         self._stream.log(at.PLACES, place)
-        self._places[index:] = [world_from_window]
 
     def _move(self, places: Sequence[Sim3], tolerance: float) -> bool:
         """Log the windows that are further from where they are shown than a tolerance."""
@@ -146,11 +145,11 @@ class RerunViewer:
             for index, (old, new) in enumerate(zip(self._places, places, strict=False))
             if new is not old and _motion(old, new, self._units[index]) > tolerance
         ]
-        kept = self._places[:]
         for index in moved:
-            kept[index] = places[index]
+            self._places[index] = places[index]
             self._log_place(index, places[index])
-        self._places = kept
+        if moved and moved[-1] == len(self._places) - 1:
+            self._frames.log_camera(places[-1])
         return bool(moved)
 
     def _log_points(self, submap: Submap, rows: NDArray[np.int64], unit: float) -> None:
@@ -194,7 +193,9 @@ class RerunViewer:
             (at.REJECTED, _REJECTED, False),
         ):
             some = [record for record in records if record.is_accepted == is_accepted]
-            lines = [[self._center(record.frame_a), self._center(record.frame_b)] for record in some]
+            lines = [
+                [self._center(record.frame_a), self._center(record.frame_b)] for record in some
+            ]
             labels = [f"{r.frame_a} - {r.frame_b}: {r.verdict}" for r in some]
             strips = rerun.LineStrips3D(
                 np.array(lines, np.float32).reshape(-1, 2, 3),

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -163,6 +164,11 @@ class BrowserSink:
     def close(self) -> None:
         """Pass on the rest; served until the process ends."""
         self.flush()
+
+    def wait(self) -> None:
+        """Serve until someone interrupts."""
+        with suppress(KeyboardInterrupt):
+            threading.Event().wait()
 
 
 def _new_stream() -> Any:
