@@ -26,7 +26,7 @@ _PLY_VERTEX = [
 ]
 _PLY_TYPES = {"<f4": "float", "|u1": "uchar"}
 
-# Open3D takes the pixel at the truncated coordinates: its pixels begin where ours have their centre.
+# Open3D truncates coordinates: its pixels begin where ours have their centre.
 _TO_CORNER = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 _NEIGHBOURS = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3), axis=-1).reshape(-1, 3)
 
