@@ -208,6 +208,22 @@ def test_the_driver_looks_along_a_camera_from_behind() -> None:
     assert (trajectory.world_from_cam[:, :3, 2] @ look).max() == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("metres", [40.0, 4000.0])
+def test_the_driver_stays_on_the_road_however_long_the_map_is(metres: float) -> None:
+    num = round(metres)
+    world_from_cam = np.tile(np.eye(4), (num, 1, 1))
+    world_from_cam[:, 2, 3] = np.arange(num)
+    trajectory = Trajectory(np.arange(num), 0.1 * np.arange(num), world_from_cam)
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-8, -3, 0], [8, 1.6, metres], (50 * num, 3))
+    points[:, 1] = np.where(np.abs(points[:, 0]) < 7, 1.6, points[:, 1])
+    viewpoint = from_driver(cloud_of(points, (90, 90, 90), 0.2), trajectory)
+    offsets = viewpoint.world_from_cam[:3, 3] - world_from_cam[:, :3, 3]
+    assert np.linalg.norm(offsets[:, :2], axis=1).min() < 1.5
+    behind = viewpoint.world_from_cam[:3, 3] - world_from_cam[0, :3, 3]
+    assert behind[2] > -4
+
+
 @pytest.mark.parametrize("view", list(CloudView))
 @pytest.mark.parametrize("num", [0, 1, 20_000])
 def test_clouds_of_any_size_give_a_picture(tmp_path: Path, view: CloudView, num: int) -> None:

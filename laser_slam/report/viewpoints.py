@@ -18,10 +18,11 @@ _MARGIN = 0.04  # of the picture, left free around the map
 _OUTLIERS = 0.2  # percent of the points, at each end of each axis, that need not be in the picture
 _BIRD_TURN_DEG, _BIRD_DROP_DEG, _BIRD_FOV_DEG = 25.0, 38.0, 40.0
 _DRIVER_FOV_DEG = 72.0
-_CELL_PX = 24
+_CELL_PX = 40
+_NEAR_PART = 3.0  # what lies nearer than so many median depths of the surface in view
 _ONE_WAY = 0.6  # length of the mean viewing direction from which on cameras look one way
 _DOWN_PRIOR = 0.003  # weight of the mean y axis against the x axes, squared sines
-_DRIVER_BACK, _DRIVER_UP, _DRIVER_NEAR = 0.12, 0.04, 0.15  # of the median depth in view
+_DRIVER_BACK, _DRIVER_UP, _DRIVER_NEAR = 0.12, 0.04, 0.15  # of the median depth of the surface
 
 
 def from_above(cloud: Cloud, trajectory: Trajectory) -> Viewpoint:
@@ -169,17 +170,20 @@ def _fitting_center(local: Array, intrinsics: Array, size: tuple[int, int]) -> A
 def _in_view(
     points: Array, world_from_cam: Array, intrinsics: Array, size: tuple[int, int]
 ) -> tuple[float, int]:
-    """Return the median depth of the points in the picture, and how good the place is.
+    """Return the median depth of what is seen first, and how good the place is.
 
-    A good place shows much of the map (points) and little background (cells).
+    A good place shows much of the map's near part (points) and little background (cells). Neither
+    depends on how far the map goes on behind.
     """
-    pixels = project((points - world_from_cam[:3, 3]) @ world_from_cam[:3, :3], intrinsics)
-    depth = (points - world_from_cam[:3, 3]) @ world_from_cam[:3, 2]
+    local = (points - world_from_cam[:3, 3]) @ world_from_cam[:3, :3]
+    pixels = project(local, intrinsics)
     with np.errstate(invalid="ignore"):
         inside = ((pixels >= 0) & (pixels < (size[1], size[0]))).all(axis=1)
     if not inside.any():
         return 1.0, 0
-    cells = (pixels[inside] // _CELL_PX).astype(np.int64)
-    return float(np.median(depth[inside])), len(cells) * len(
-        np.unique(cells[:, 0] + cells[:, 1] * size[1])
-    )
+    order = np.argsort(local[inside, 2])
+    depths = local[inside, 2][order]
+    cells = (pixels[inside][order] // _CELL_PX).astype(np.int64)
+    _, nearest = np.unique(cells[:, 0] + cells[:, 1] * size[1], return_index=True)
+    depth = float(np.median(depths[nearest]))
+    return depth, len(nearest) * int((depths < _NEAR_PART * depth).sum())
