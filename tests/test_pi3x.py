@@ -179,6 +179,12 @@ def test_units_of_depths_and_poses_and_axes_of_the_world_do_not_matter(
     assert_same(predict(mini, images, same), out, tolerance=1e-4)
 
 
+def test_the_pose_of_one_frame_says_nothing(mini: Pi3X, images: Tensor) -> None:
+    _, _, world_from_cam = make_told()
+    heard = predict(mini, images[:, 2:], Conditions(world_from_cam=world_from_cam[:, 2:]))
+    assert_same(heard, predict(mini, images[:, 2:]), tolerance=1e-6)
+
+
 @pytest.mark.parametrize("num_frames", [1, 20])
 def test_windows_may_be_of_any_length(mini: Pi3X, num_frames: int) -> None:
     generator = torch.Generator().manual_seed(num_frames)

@@ -19,7 +19,8 @@ class Conditions(NamedTuple):
     Attributes:
         depths: (B, N, H, W) z along the optical axis; NaN or not positive: unknown.
         intrinsics: (B, N, 3, 3) in pixels of the images, whose centres are at integers.
-        world_from_cam: (B, N, 4, 4) rigid, in the unit of the depths.
+        world_from_cam: (B, N, 4, 4) rigid, in the unit of the depths; of two frames or more. The
+            network was trained with poses only where it was told intrinsics, too.
     """
 
     depths: Tensor | None = None
@@ -56,8 +57,8 @@ def relative_poses(world_from_cam: Tensor, mean_depths: Tensor | None) -> Tensor
 
     Args:
         world_from_cam: (B, N, 4, 4) rigid.
-        mean_depths: (B,) that become the unit; None: the mean distance from the first camera,
-            unless all cameras stand still.
+        mean_depths: (B,) that become the unit; None: the mean distance of the other cameras from
+            the first, unless all stand still.
     """
     first_from_cam = torch.linalg.inv(world_from_cam[:, :1].float()) @ world_from_cam.float()
     units = _mean_distances(first_from_cam) if mean_depths is None else mean_depths
@@ -67,9 +68,9 @@ def relative_poses(world_from_cam: Tensor, mean_depths: Tensor | None) -> Tensor
 
 
 def _mean_distances(first_from_cam: Tensor) -> Tensor:
-    distances: Tensor = first_from_cam[..., :3, 3].norm(dim=-1)
+    distances: Tensor = first_from_cam[:, 1:, :3, 3].norm(dim=-1)
     is_still = (distances < STILL).all(dim=1)
-    return torch.where(is_still, torch.ones_like(distances[:, 0]), distances.mean(dim=1))
+    return torch.where(is_still, 1, distances.mean(dim=1))
 
 
 class CameraFrames(NamedTuple):

@@ -174,8 +174,8 @@ class Pi3X(Trunk):
         return patches
 
     def _injection(self, told: Conditions, layout: Layout) -> Injection | None:
-        """Return what adds poses to tokens inside the decoder; None: no poses are known."""
-        if told.world_from_cam is None:
+        """Return what adds poses to tokens inside the decoder; None: nothing is known of them."""
+        if told.world_from_cam is None or layout.num_frames == 1:
             return None
         channels = self.config.encoder.width // self.config.num_heads
         with full_precision(told.world_from_cam):
