@@ -88,7 +88,8 @@ class PerfectPi3X(PerfectPi3):
         if conditions is not None and conditions.intrinsics is not None:
             K = conditions.intrinsics[0, 0]
             centre = (float(K[0, 2]), float(K[1, 2]))
-        return Pi3XOutput(*self.points(1.0, centre), torch.ones(1))
+        local, logits, poses, tokens = self.points(1.0, centre)
+        return Pi3XOutput(local, logits, poses, tokens, torch.ones(1))
 
 
 class PerfectVggt(PerfectPi3):
@@ -132,7 +133,7 @@ class Knowing:
     def __init__(self, name: str, *more: str) -> None:
         backbone, network = MAKERS[name]
         self.network = network()
-        self.backbone: Any = backbone(settings(*more), self.network)  # type: ignore[arg-type]
+        self.backbone: Any = backbone(settings(*more), self.network)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.backbone, name)

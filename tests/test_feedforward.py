@@ -155,8 +155,12 @@ def test_a_camera_listens_to_confident_pixels() -> None:
 
 def test_what_no_pinhole_camera_sees_has_none() -> None:
     points, confidence = cloud(4)
-    assert fit_camera(points * np.float32([-1, 1, 1]), confidence, CENTRE) is None  # mirrored
-    assert fit_camera(points * np.float32([1e-3, 1, 1]), confidence, CENTRE) is None  # all ahead
+    assert (
+        fit_camera(points * np.array([-1, 1, 1], np.float32), confidence, CENTRE) is None
+    )  # mirrored
+    assert (
+        fit_camera(points * np.array([1e-3, 1, 1], np.float32), confidence, CENTRE) is None
+    )  # all ahead
     assert fit_camera(np.full_like(points, np.nan), confidence, CENTRE) is None
     assert fit_camera(points, np.zeros_like(confidence), CENTRE) is None
     assert fit_camera(points[:, :2, :2], confidence[:, :2, :2], (0.5, 0.5)) is None
@@ -167,7 +171,9 @@ def test_a_window_has_the_camera_that_most_frames_agree_on() -> None:
     cameras[1, 0, 0] *= 3
     cameras[2] = np.nan
     cameras[3, 1, 1] = 0
-    np.testing.assert_allclose(window_camera(cameras), camera(CENTRE))
+    found = window_camera(cameras)
+    assert found is not None
+    np.testing.assert_allclose(found, camera(CENTRE))
     assert window_camera(cameras[2:4]) is None
 
 

@@ -27,11 +27,11 @@ from laser_slam.networks.vggt import Vggt, VggtConfig
 KITTI = (154, 518)
 
 
-class Count(TorchDispatchMode):
+class Count(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """Add up the tensors that are alive, in bytes; those of the network are not counted."""
 
     def __init__(self, network: nn.Module) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]
         self.now, self.peak = 0, 0
         weights = [*network.parameters(), *network.buffers()]
         self.alive = {id(w.untyped_storage()): weakref.ref(w.untyped_storage()) for w in weights}
@@ -84,7 +84,7 @@ def counted(job: Job, num_frames: int, monkeypatch: pytest.MonkeyPatch) -> int:
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
     with torch.inference_mode(), Count(network) as count:
         network(torch.empty(1, num_frames, 3, *job.size, device="meta"))
-    return count.peak
+    return int(count.peak)
 
 
 @pytest.mark.parametrize(

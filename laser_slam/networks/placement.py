@@ -116,7 +116,7 @@ def is_out_of_memory(error: RuntimeError) -> bool:
 
 def is_overflow(error: RuntimeError) -> bool:
     """Tell whether a matrix could not be decomposed, as happens to numbers that are not finite."""
-    return isinstance(error, torch.linalg.LinAlgError)
+    return isinstance(error, torch.linalg.LinAlgError)  # type: ignore[attr-defined]
 
 
 def _devices() -> list[str]:

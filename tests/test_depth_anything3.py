@@ -1,0 +1,139 @@
+"""The adapter of another's package, against a stand-in with that package's interface."""
+
+import sys
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from corridor import view
+from numpy.typing import NDArray
+from perfect import CONFIDENCE, SIZE, camera, seen
+
+from laser_slam.backbones import make_backbone
+from laser_slam.config import load_config
+from laser_slam.config.backbones import BackboneConfig
+from laser_slam.errors import DependencyError, WeightsError
+from laser_slam.rectification import resize_image
+from laser_slam.sim3 import rotation_log
+from laser_slam.types import Prediction, WindowStatus
+
+FRAMES = np.arange(20, 26)
+UNIT_M = 3.5
+K = camera((SIZE[1] / 2, SIZE[0] / 2))
+
+
+@dataclass
+class Answer:
+    """What the package's ``inference`` returns, as far as it matters here."""
+
+    depth: Any
+    conf: Any
+    extrinsics: Any
+    intrinsics: Any
+
+
+class StandIn:
+    """A model that knows the corridor; world-to-camera poses of three rows, as the package's."""
+
+    has_poses = True
+    rows = 3
+
+    @classmethod
+    def from_pretrained(cls, name: str) -> "StandIn":
+        if name == "nobody/nothing":
+            raise OSError("nobody/nothing is not a local folder\nand is not a valid model")
+        return cls()
+
+    def to(self, device: str) -> "StandIn":
+        self.device = device
+        return self
+
+    def eval(self) -> "StandIn":
+        return self
+
+    def inference(self, image: list[NDArray[np.uint8]], process_res: int = 504) -> Answer:
+        assert all(one.shape == (*SIZE, 3) for one in image)
+        assert process_res == max(SIZE)
+        depth, world_from_cam = seen(FRAMES, K)
+        cam_from_world = np.linalg.inv(world_from_cam)
+        cam_from_world[:, :3, 3] /= UNIT_M
+        if not self.has_poses:
+            return Answer(depth, None, None, None)
+        return Answer(
+            (depth / UNIT_M).astype(np.float32),
+            np.full(depth.shape, 1 / (1 - CONFIDENCE), np.float32),
+            cam_from_world[:, : self.rows].astype(np.float32),
+            np.tile(K, (len(FRAMES), 1, 1)).astype(np.float32),
+        )
+
+
+@pytest.fixture(autouse=True)
+def _installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    package, api = ModuleType("depth_anything_3"), ModuleType("depth_anything_3.api")
+    api.DepthAnything3 = StandIn  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "depth_anything_3", package)
+    monkeypatch.setitem(sys.modules, "depth_anything_3.api", api)
+
+
+def settings(*more: str) -> BackboneConfig:
+    chosen = ["backbone.name=depth_anything3", "backbone.depth_anything3.side=126"]
+    return load_config(assignments=[*chosen, *more]).backbone
+
+
+def predict() -> Prediction:
+    images = [resize_image(view(int(frame))[0], SIZE) for frame in FRAMES]
+    return make_backbone(settings()).predict(images, FRAMES, None)
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_the_truth_in_the_packages_terms_comes_back_as_the_truth(
+    monkeypatch: pytest.MonkeyPatch, rows: int
+) -> None:
+    monkeypatch.setattr(StandIn, "rows", rows)
+    found = predict()
+    depth, world_from_cam = seen(FRAMES, K)
+    assert found.status is WindowStatus.OK
+    np.testing.assert_allclose(found.depth * UNIT_M, depth, rtol=1e-5)
+    np.testing.assert_allclose(found.confidence, CONFIDENCE, rtol=1e-5)
+    np.testing.assert_allclose(found.intrinsics[2], K, rtol=1e-6)
+    relative = np.linalg.inv(world_from_cam[0]) @ world_from_cam
+    turn = found.window_from_cam[:, :3, :3].transpose(0, 2, 1) @ relative[:, :3, :3]
+    assert np.abs(rotation_log(turn)).max() < 1e-5
+    np.testing.assert_allclose(
+        found.window_from_cam[:, :3, 3] * UNIT_M, relative[:, :3, 3], atol=1e-4
+    )
+
+
+def test_images_arrive_at_the_size_that_the_package_would_make_of_them() -> None:
+    backbone = make_backbone(settings("backbone.depth_anything3.side=504"))
+    assert backbone.image_size((376, 1241)) == (154, 504)
+    assert backbone.image_size((480, 640)) == (378, 504)
+    assert backbone.identity()["model"] == "depth-anything/DA3-LARGE"
+    assert backbone.sees_far_frames
+    assert not backbone.remembers
+
+
+def test_a_model_without_poses_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(StandIn, "has_poses", False)
+    with pytest.raises(WeightsError, match=r"depth_anything3\.model: .* gives no poses; take one"):
+        predict()
+
+
+def test_without_the_package_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "depth_anything_3.api", None)
+    with pytest.raises(
+        DependencyError, match=r"needs its authors' package .* pip install git"
+    ) as e:
+        make_backbone(settings())
+    assert "\n" not in str(e.value)
+
+
+def test_a_model_that_cannot_be_had_is_one_line() -> None:
+    with pytest.raises(WeightsError) as caught:
+        make_backbone(settings("backbone.depth_anything3.model=nobody/nothing"))
+    assert "'nobody/nothing' cannot be had (nobody/nothing is not a local folder)" in str(
+        caught.value
+    )
+    assert "\n" not in str(caught.value)
