@@ -52,6 +52,7 @@ class RerunViewer:
         self._budget = PointBudget(config.points_per_window, config.max_points)
         self._frames = FrameLogger(sink.stream, config, fusion)
         self._places: list[Sim3] = []  # as they were logged last
+        self._newest: Sequence[Sim3] = ()
         self._units: list[float] = []  # median depth of each window, in its own unit
         self._centers: dict[int, tuple[int, Array]] = {}  # of frames: window, and place in it
         self._verdicts: list[str] = []
@@ -81,6 +82,7 @@ class RerunViewer:
 
     def loops(self, places: Sequence[Sim3], records: Sequence[CandidateRecord]) -> None:
         """Show where windows are by now, and what became of the loop candidates so far."""
+        self._newest = places
         has_moved = self._move(places, self._config.move_tolerance)
         if has_moved or [record.verdict for record in records] != self._verdicts:
             self._log_candidates(records)
@@ -88,6 +90,7 @@ class RerunViewer:
 
     def results(self, cloud: Cloud, path: Trajectory, path_without_loops: Trajectory) -> None:
         """Show what the run ends with, at any time and in a view of its own."""
+        self._move(self._newest, 0.0)
         rerun, num = self._rerun, min(len(cloud.points), self._config.max_points)
         kept = np.random.default_rng(0).choice(len(cloud.points), num, replace=False)
         kept.sort()
