@@ -276,6 +276,31 @@ def test_the_largest_page_stays_small(bare: Path) -> None:
     assert len(page.all("img")) == 9 + 2 * 24
 
 
+def contrast(first: str, second: str) -> float:
+    """Return the WCAG contrast of two colours, #rgb or #rrggbb."""
+
+    def luminance(color: str) -> float:
+        digits = color[1:] if len(color) == 7 else "".join(2 * digit for digit in color[1:])
+        levels = np.array([int(digits[i : i + 2], 16) for i in (0, 2, 4)]) / 255
+        linear = np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)
+        return float(linear @ [0.2126, 0.7152, 0.0722])
+
+    dark, light = sorted((luminance(first), luminance(second)))
+    return (light + 0.05) / (dark + 0.05)
+
+
+def test_text_and_lines_stand_out_from_the_paper_in_light_and_in_dark(bare: Path) -> None:
+    write_report_page(bare)
+    text = (bare / "report.html").read_text()
+    roots = re.findall(r":root \{(.*?)\}", text, re.DOTALL)[:2]
+    schemes = [dict(re.findall(r"--([a-z-]+): (#[0-9a-f]+)", root)) for root in roots]
+    assert len(schemes) == 2
+    for colors in schemes:
+        assert contrast(colors["warn"], colors["warn-soft"]) > 4.5
+        for name in ("ink", "muted", "link", "without", "estimate", "accepted", "rejected"):
+            assert contrast(colors[name], colors["paper"]) > 4.5, name
+
+
 # --- what a run may lack ------------------------------------------------------------------------
 
 
@@ -379,6 +404,16 @@ def test_an_unfiltered_map_stands_beside_the_filtered_one(full: Path, tmp_path: 
     pictures = tmp_path / "run" / "pictures"
     shutil.copy(pictures / "map_bird.png", pictures / "map_bird_unfiltered.png")
     assert "Oblique Oblique, unfiltered" in page_of(tmp_path / "run").text
+
+
+def test_a_picture_that_no_part_asks_for_is_shown_too(full: Path, tmp_path: Path) -> None:
+    shutil.copytree(full, tmp_path / "run")
+    before = len(page_of(tmp_path / "run").all("img"))
+    pictures = tmp_path / "run" / "pictures"
+    shutil.copy(pictures / "map_bird.png", pictures / "point_errors.png")
+    page = page_of(tmp_path / "run")
+    assert len(page.all("img")) == before + 1
+    assert "Point errors" in page.text
 
 
 @pytest.mark.parametrize(

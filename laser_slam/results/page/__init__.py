@@ -10,11 +10,11 @@ from laser_slam import __version__
 from laser_slam.errors import RunFolderError
 from laser_slam.report.html import Page, render_page
 from laser_slam.results.page.loops import loops
-from laser_slam.results.page.paths import trajectory, world_map
+from laser_slam.results.page.paths import depths, trajectory, world_map
 from laser_slam.results.page.reading import Report, look
 from laser_slam.results.page.run import details, facts, group_warnings, settings, time_by_stage
 from laser_slam.results.page.scores import accuracy, headline
-from laser_slam.results.page.windows import depths, windows
+from laser_slam.results.page.windows import windows
 from laser_slam.store import write_text
 
 

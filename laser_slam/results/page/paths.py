@@ -29,6 +29,7 @@ _VIEWS = (
 )
 _MAX_LINKS = 60  # rejected ones; more would hide the path
 _UNFILTERED = "_unfiltered"
+_MAX_OTHERS = 4  # pictures that no part of the page asks for
 _DRAWN = (  # for a report of an older version
     ("trajectory", "Trajectory from above"),
     ("loops", "Trajectory without and with loops"),
@@ -162,3 +163,29 @@ def _with_gaps(pairs: NDArray[np.float64]) -> NDArray[np.float64]:
     """Turn (N, 2) ends into one line with a gap after each pair."""
     gaps = np.full((len(pairs), 1), np.nan)
     return np.concatenate([pairs, gaps], axis=1).ravel()
+
+
+def depths(folder: Path) -> Section:
+    """Show depth and layers of a few keyframes, then pictures that no other part asks for."""
+    names = [
+        ("depth", "Image, inverse depth, confidence", "Keyframes of the run: depth, confidence"),
+        ("layers", "Image, layers, their scales", "Keyframes of the run: layers and their scales"),
+    ]
+    others = sorted({path.stem for path in (folder / "pictures").glob("*.png")} - _ELSEWHERE)
+    for name in others[:_MAX_OTHERS]:
+        words = name.replace("_", " ").capitalize()
+        names.append((name, words, f"Picture of the run: {words}"))
+    drawn = [find_picture(folder, *each) for each in names]
+    pictures = [picture for picture in drawn if picture is not None]
+    return Section(
+        "depth",
+        "Depth" if not others else "Depth and more",
+        [Pictures(pictures)] if pictures else [],
+    )
+
+
+_ELSEWHERE = {
+    *(name + end for name, _ in _VIEWS for end in ("", _UNFILTERED)),
+    *(name for name, _ in _DRAWN),
+    *("depth", "layers", "layer_mismatch", "loop_pairs", "scales", "similarity", "stages"),
+}

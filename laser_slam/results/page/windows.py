@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.report.html import Block, Charts, Fold, Picture, Pictures, Section, Table, Text
+from laser_slam.report.html import Block, Charts, Fold, Pictures, Section, Table, Text
 from laser_slam.report.html_charts import Axis, Chart, Line, Role, line_chart
 from laser_slam.results.page.paths import find_picture
 from laser_slam.results.page.reading import (
@@ -210,13 +210,3 @@ def _lines(rows: Sequence[Report], x: str, names: Sequence[tuple[str, str, Role]
         for name, label, role in names
         if np.isfinite(column(rows, name)).any()
     ]
-
-
-def depths(folder: Path) -> Section:
-    """Show depth and layers of a few keyframes, and pictures that nothing else shows."""
-    shown = [
-        find_picture(folder, "depth", "Image, inverse depth, confidence", "Keyframes of the run"),
-        find_picture(folder, "layers", "Image, layers, their scales", "Layers of a few keyframes"),
-    ]
-    pictures: list[Picture] = [picture for picture in shown if picture is not None]
-    return Section("depth", "Depth", [Pictures(pictures)] if pictures else [])
