@@ -110,7 +110,7 @@ def test_images_arrive_at_the_size_that_the_package_would_make_of_them() -> None
     backbone = make_backbone(settings("backbone.depth_anything3.side=504"))
     assert backbone.image_size((376, 1241)) == (154, 504)
     assert backbone.image_size((480, 640)) == (378, 504)
-    assert backbone.identity()["model"] == "depth-anything/DA3-LARGE"
+    assert backbone.identity()["model"] == "depth-anything/DA3-BASE"
     assert backbone.sees_far_frames
     assert not backbone.remembers
 

@@ -78,7 +78,7 @@ class DepthAnything3Backbone:
         if seen.extrinsics is None or seen.intrinsics is None or seen.conf is None:
             raise WeightsError(
                 f"backbone.depth_anything3.model: {self._config.model} gives no poses; "
-                "take one for any number of views, such as depth-anything/DA3-LARGE"
+                "take one for any number of views, such as depth-anything/DA3-BASE"
             )
         cam_from_world = np.tile(np.eye(4), (len(frames), 1, 1))
         cam_from_world[:, :3] = seen.extrinsics[:, :3]  # OpenCV's axes, as ours

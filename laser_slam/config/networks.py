@@ -46,7 +46,7 @@ class DepthAnything3Config(Section):
     """Depth Anything 3, by its authors' own package."""
 
     model: str = Field(
-        "depth-anything/DA3-LARGE", description="name on the Hugging Face hub, or a folder"
+        "depth-anything/DA3-BASE", description="name on the Hugging Face hub, or a folder"
     )
     device: str = Field("auto", description="cpu, cuda, cuda:1; auto: cuda if it is there")
     side: int = Field(504, ge=28, le=4096, multiple_of=14, description="longer side of images, px")
