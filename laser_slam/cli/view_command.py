@@ -31,7 +31,6 @@ def view(
     sink: Sink
     if serve:
         sink = BrowserSink(port)
-        typer.echo(f"open {sink.url}; Ctrl-C ends it")
     elif save is not None or not has_display():
         sink = FileSink(save or run / RECORDING)
     else:
@@ -44,4 +43,5 @@ def view(
             f"{num_windows} windows in {sink.path} ({size:.0f} MB); open it with: rerun {sink.path}"
         )
     elif isinstance(sink, BrowserSink):
+        typer.echo(f"open {sink.url}; Ctrl-C ends it")
         sink.wait()

@@ -104,9 +104,11 @@ class WindowSink:
     """
 
     def __init__(self) -> None:
+        rerun = import_rerun()
         self.stream = _new_stream()
+        options = {"executable_path": _executable(), "hide_welcome_screen": True}
         try:
-            self.stream.spawn(executable_path=_executable(), hide_welcome_screen=True)
+            rerun.spawn(recording=self.stream, **options)
         except (RuntimeError, OSError) as error:
             raise LaserSlamError(
                 f"rerun's viewer does not start ({error}); write a recording instead: "
