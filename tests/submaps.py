@@ -9,7 +9,12 @@ from laser_slam.types import Prediction, Submap
 
 SIZE = (24, 40)
 EVERYTHING = FusionConfig(
-    min_confidence=0.0, max_range=1e6, edge_jump=1e6, voxel_size=0.05, min_observations=1
+    agreement=0.0,
+    min_confidence=0.0,
+    max_range=1e6,
+    edge_jump=1e6,
+    voxel_size=0.05,
+    min_observations=1,
 )
 
 

@@ -17,6 +17,14 @@ class FusionConfig(Section):
     edge_jump: float = Field(
         0.05, gt=0, description="depth step between neighbours that makes an edge, in its depth"
     )
+    agreement: float = Field(
+        0.03,
+        ge=0,
+        description="relative depth difference within which frames agree on a pixel; 0: not asked",
+    )
+    min_agreeing: int = Field(
+        1, ge=0, le=6, description="frames around that must agree with a pixel"
+    )
     stride: int = Field(1, ge=1, description="every so many-th row and column is used")
     voxel_size: float = Field(
         0.0, ge=0, description="edge of the averaging voxels in world units; 0: auto_voxel decides"
@@ -25,7 +33,7 @@ class FusionConfig(Section):
         0.006, gt=0, description="edge of the voxels, in median depths of the first good window"
     )
     min_observations: int = Field(
-        8, ge=1, description="views that a voxel and its 26 neighbours need in sum; fewer: noise"
+        20, ge=1, description="views that a voxel and its 26 neighbours need in sum; fewer: noise"
     )
     tile_bits: int = Field(
         8, ge=3, le=12, description="the map is made in cubes of 2^tile_bits voxels"

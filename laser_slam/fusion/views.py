@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from laser_slam.config import FusionConfig
+from laser_slam.fusion.consistency import consistent_depth
 from laser_slam.fusion.edges import drop_edges
 from laser_slam.types import Submap
 
@@ -63,17 +64,17 @@ def owned_views(submap: Submap, config: FusionConfig) -> Iterator[View]:
         place = submap.places[i] if submap.places else submap.world_from_window
         world_from_cam = place.apply_poses(prediction.window_from_cam[i])
         cam_from_pixel = np.linalg.inv(prediction.intrinsics[i])
-        view = View(
-            depth=np.ascontiguousarray(depth, np.float32),
-            weight=np.where(usable, confidence, 0).astype(np.float32),
+        weight = np.where(usable, confidence, 0).astype(np.float32)
+        drop_edges(np.ascontiguousarray(depth, np.float32), config.edge_jump, weight)
+        yield View(
+            depth=consistent_depth(prediction, int(i), weight, config),
+            weight=weight,
             color=np.ascontiguousarray(submap.colors[i]),
             world_from_ray=np.ascontiguousarray(
                 place.scale * world_from_cam[:3, :3] @ cam_from_pixel
             ),
             center=world_from_cam[:3, 3].copy(),
         )
-        drop_edges(view.depth, config.edge_jump, view.weight)
-        yield view
 
 
 @njit(cache=True, nogil=True, inline="always")

@@ -2,6 +2,7 @@
 
 from laser_slam.results.findings import Findings, draw_findings, write_findings
 from laser_slam.results.loops import CHAINED_FILE, Loops, describe_loops, look_back
+from laser_slam.results.mapping import TILES, fuse_run, place_window
 from laser_slam.results.page import read_report, write_report_page
 from laser_slam.results.paths import describe_paths
 from laser_slam.results.pictures import draw_trajectory
@@ -22,6 +23,7 @@ from laser_slam.results.windows import describe_course, describe_windows
 
 __all__ = [
     "CHAINED_FILE",
+    "TILES",
     "Findings",
     "KeyframeView",
     "Loops",
@@ -36,7 +38,9 @@ __all__ = [
     "describe_windows",
     "draw_findings",
     "draw_trajectory",
+    "fuse_run",
     "look_back",
+    "place_window",
     "read_report",
     "sample_views",
     "score_views",

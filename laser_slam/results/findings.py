@@ -19,7 +19,7 @@ from laser_slam.results.pictures import (
 )
 from laser_slam.results.scores import Scores
 from laser_slam.slam import Node, Slam
-from laser_slam.store import WindowFiles
+from laser_slam.store import TileFiles, WindowFiles
 from laser_slam.store.keyframes import save_keyframes
 from laser_slam.types import Cloud, Trajectory
 
@@ -30,10 +30,11 @@ class Findings:
 
     Attributes:
         trajectory: a pose for every frame of the input.
-        cloud: the map, in world units.
+        cloud: the map, in world units; of a large one an even part.
         scores: what the truth says of them.
         loops: what became of the loops; None: they were not looked for.
         truth: poses in metres; None: there is none.
+        tiles: the whole map on disk; None: ``cloud`` is the whole.
     """
 
     trajectory: Trajectory
@@ -41,6 +42,7 @@ class Findings:
     scores: Scores
     loops: Loops | None
     truth: Trajectory | None
+    tiles: TileFiles | None = None
 
 
 def write_findings(folder: Path, found: Findings, slam: Slam) -> None:
@@ -50,7 +52,7 @@ def write_findings(folder: Path, found: Findings, slam: Slam) -> None:
         RunFolderError: a file cannot be written.
     """
     write_trajectories(folder, found.trajectory, found.truth)
-    write_ply(folder / "map.ply", found.cloud)
+    write_ply(folder / "map.ply", found.cloud if found.tiles is None else found.tiles.clouds)
     save_keyframes(folder, list_keyframes(slam))
     if found.loops is not None:
         write_loops(folder, found.loops, slam)

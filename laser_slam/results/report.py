@@ -46,7 +46,7 @@ class Results:
     Attributes:
         folder: where all of it lies.
         trajectory: a pose for every frame of the input.
-        cloud: the map, in world units.
+        cloud: the map, in world units; of a large one an even part, ``map.ply`` has it all.
         report: all numbers, as in ``report.json``.
     """
 
