@@ -217,6 +217,8 @@ def test_the_page_says_the_numbers_of_the_report(full: Path) -> None:
     assert "frame 4 cannot be read (and 1 more like it)" in text
     assert "no true depth to compare with" in text
     assert "fuse 3.0 75.0 %" in text
+    assert "layers.refused 23" in text
+    assert "closures.refused (entries) 1" in text
 
 
 def test_closed_loops_come_before_rejected_ones_and_show_their_images(full: Path) -> None:
@@ -361,6 +363,13 @@ def test_any_value_of_the_report_may_be_null_or_missing(bare: Path) -> None:
 def test_what_is_unknown_says_why(bare: Path, parts: dict[str, Any], words: str) -> None:
     change(bare, **parts)
     assert words in page_of(bare).text
+
+
+def test_counters_of_new_parts_are_listed(bare: Path) -> None:
+    change(bare, predictions={"hits": 17, "all": [1, 2, 3]}, tiles=4)
+    text = page_of(bare).text
+    for words in ("predictions.hits 17", "predictions.all (entries) 3", "tiles 4"):
+        assert words in text
 
 
 def test_a_path_too_short_for_kittis_scores_says_so(bare: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -28,8 +28,10 @@ from laser_slam.results.page.reading import (
 _MAX_WARNINGS = 300
 _MAX_GROUPS = 12  # at the top of the page
 _NUMBER = re.compile(r"\d+(\.\d+)?")
-# What the page shows in full elsewhere, or is no counter.
-_SERIES = ("records", "sigmas", "refused", "trajectory_without", "windows", "bridged")
+_NO_COUNTERS = {
+    *("sequence", "trajectory", "depth", "depth_without_layers", "paths"),
+    *("warnings", "seconds", "versions", "settings", "finished"),
+}
 
 
 def facts(report: Report) -> list[str]:
@@ -142,7 +144,9 @@ def details(report: Report, folder: Path) -> Section:
     blocks = [_calibration(report), _counters(report), *_all_warnings(report)]
     versions = [[name, plain(value)] for name, value in flatten(look(report, "versions") or {})]
     if versions:
-        table = Table("Versions", ["package", "version"], versions, frozenset({1}))
+        table = Table(
+            "Of laser-slam and what it used", ["package", "version"], versions, frozenset({1})
+        )
         blocks.append(Fold("Versions", [table]))
     return Section("details", "Details", [*blocks, _files(folder)])
 
@@ -167,25 +171,27 @@ _FOUR = ("fx", "fy", "cx", "cy")
 
 
 def _counters(report: Report) -> Block:
+    """List every number that is no score, no series and no setting; new parts of a report too."""
     rows = [
         [name, plain(value)]
-        for part in ("frames", "windows", "layers", "closures", "map")
-        for name, value in flatten({part: _without_series(look(report, part))})
+        for part in report
+        if part not in _NO_COUNTERS
+        for name, value in flatten({part: _without_series(report[part])})
     ]
-    for name in ("peak_memory_mib", "frames_per_second"):
-        rows.append([name, plain(look(report, name))])
     table = Table("Names as in report.json; null: unknown", ["counter", "value"], rows)
     return Fold("Counters", [table])
 
 
 def _without_series(part: Any) -> Any:
-    if not isinstance(part, dict):
-        return part
-    kept = {key: value for key, value in part.items() if key not in _SERIES}
-    lengths = {
-        key: len(part[key]) for key in ("bridged", "refused") if isinstance(part.get(key), dict)
+    """Keep what is a single value, and count the rest."""
+    if not isinstance(part, Mapping):
+        return f"{len(part)} entries" if isinstance(part, list) else part
+    return {
+        key if not isinstance(value, Mapping | list) else f"{key} (entries)": (
+            len(value) if isinstance(value, Mapping | list) else value
+        )
+        for key, value in part.items()
     }
-    return {**kept, **lengths}
 
 
 def _all_warnings(report: Report) -> list[Block]:
