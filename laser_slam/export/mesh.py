@@ -104,7 +104,7 @@ def build_mesh(source: Source) -> Mesh:
             f"{source.name} has no surface that {config.mesh_min_views:g} frames have seen; "
             "lower export.mesh_min_views or raise export.mesh_voxel"
         )
-    return _weld(pieces, voxel_size, volume.tile_blocks * _BLOCK)
+    return _weld(pieces, volume)
 
 
 def _frames_of_tiles(source: Source, volume: _Volume) -> dict[Tile, set[int]]:
@@ -115,42 +115,58 @@ def _frames_of_tiles(source: Source, volume: _Volume) -> dict[Tile, set[int]]:
         blocks = volume.blocks(view)
         for shift in _NEIGHBOURS:
             found = out if not shift.any() else beyond
-            for tile in np.unique((blocks + shift) // volume.tile_blocks, axis=0).tolist():
+            for tile in np.unique(volume.tiles(blocks + shift), axis=0).tolist():
                 found[(tile[0], tile[1], tile[2])].add(view.frame)
     # Who only sees the blocks around a tile shapes the cells at its border too.
     return {tile: frames | beyond[tile] for tile, frames in out.items()}
 
 
 class _Volume:
-    """Signed distances by Open3D, of one tile at a time."""
+    """Signed distances by Open3D, of one tile at a time; the origin is in the middle of a tile."""
 
     def __init__(self, voxel_size: float, truncation: float, tile_blocks: int) -> None:
         self._open3d = import_open3d()
-        self.voxel_size, self.truncation, self.tile_blocks = voxel_size, truncation, tile_blocks
+        self._voxel_size, self._truncation = voxel_size, truncation
+        self._tile_blocks = tile_blocks
+        self._probe = self._grid(1)
 
-    def blocks(self, view: DepthView) -> NDArray[np.int32]:
+    def tiles(self, blocks: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the (M, 3) tiles that blocks are in."""
+        return np.asarray((blocks + self._tile_blocks // 2) // self._tile_blocks)
+
+    def blocks_of(self, points: Array) -> Array:
+        """Return where points are, in blocks."""
+        return points / (self._voxel_size * _BLOCK)
+
+    def is_at_border(self, points: Array) -> NDArray[np.bool_]:
+        """Tell which points are within a voxel of a tile's border."""
+        tiles = (self.blocks_of(points) + self._tile_blocks // 2) / self._tile_blocks
+        voxels = np.abs(tiles - np.rint(tiles)) * self._tile_blocks * _BLOCK
+        return np.asarray((voxels < 1).any(axis=1))
+
+    def blocks(self, view: DepthView) -> NDArray[np.int64]:
         """Return the (M, 3) blocks that a depth map is near to."""
         if not (view.depth > 0).any():
-            return np.empty((0, 3), np.int32)
+            return np.empty((0, 3), np.int64)
         image, _, intrinsics, cam_from_world = self._inputs(view)
-        found = self._grid(1).compute_unique_block_coordinates(
-            image, intrinsics, cam_from_world, 1.0, _FAR, self.truncation
+        found = self._probe.compute_unique_block_coordinates(
+            image, intrinsics, cam_from_world, 1.0, _FAR, self._truncation
         )
-        return np.asarray(found.numpy(), np.int32)
+        return np.asarray(found.numpy(), np.int64)
 
     def piece(self, tile: Tile, views: Iterator[DepthView], min_views: float) -> Mesh:
         """Return the triangles whose middle lies in a tile."""
         grid = self._grid(1000)
-        low = np.array(tile, np.int32) * self.tile_blocks - 1
-        high = low + self.tile_blocks + 2
+        low = np.array(tile, np.int32) * self._tile_blocks - self._tile_blocks // 2 - 1
+        high = low + self._tile_blocks + 2
         for view in views:
             blocks = self.blocks(view)
             blocks = blocks[((blocks >= low) & (blocks < high)).all(axis=1)]
             if len(blocks):
                 image, color, intrinsics, cam_from_world = self._inputs(view)
-                wanted = self._open3d.core.Tensor(np.ascontiguousarray(blocks))
+                wanted = self._open3d.core.Tensor(np.ascontiguousarray(blocks, np.int32))
                 grid.integrate(
-                    wanted, image, color, intrinsics, cam_from_world, 1.0, _FAR, self.truncation
+                    wanted, image, color, intrinsics, cam_from_world, 1.0, _FAR, self._truncation
                 )
         return self._inside(tile, grid.extract_triangle_mesh(min_views))
 
@@ -160,8 +176,8 @@ class _Volume:
         triangles = mesh.triangle.indices.numpy()
         vertices = mesh.vertex.positions.numpy()
         middles = vertices[triangles].astype(np.float64).mean(axis=1)
-        edge = self.voxel_size * _BLOCK * self.tile_blocks
-        is_inside = (np.floor(middles / edge) == np.array(tile)).all(axis=1)
+        blocks = np.floor(self.blocks_of(middles)).astype(np.int64)
+        is_inside = (self.tiles(blocks) == np.array(tile)).all(axis=1)
         used, rows = np.unique(triangles[is_inside], return_inverse=True)
         colors = np.rint(mesh.vertex.colors.numpy()[used].clip(0, 1) * 255).astype(np.uint8)
         normals = mesh.vertex.normals.numpy()[used]
@@ -173,7 +189,7 @@ class _Volume:
             ("tsdf", "weight", "color"),
             (core.float32, core.float32, core.float32),
             ((1,), (1,), (3,)),
-            self.voxel_size,
+            self._voxel_size,
             _BLOCK,
             num_blocks,
         )
@@ -199,7 +215,7 @@ _EMPTY = Mesh(
 )
 
 
-def _weld(pieces: list[Mesh], voxel_size: float, tile_voxels: int) -> Mesh:
+def _weld(pieces: list[Mesh], volume: _Volume) -> Mesh:
     """Join the tiles; vertices that two of them have, at their common border, become one."""
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
     vertices, normals, colors = (
@@ -208,9 +224,7 @@ def _weld(pieces: list[Mesh], voxel_size: float, tile_voxels: int) -> Mesh:
     triangles = np.concatenate(
         [piece.triangles + start for piece, start in zip(pieces, starts[:-1], strict=True)]
     )
-    tiles = vertices / (voxel_size * tile_voxels)
-    is_border = (np.abs(tiles - np.rint(tiles)) * tile_voxels < 1).any(axis=1)
-    border = np.flatnonzero(is_border)
+    border = np.flatnonzero(volume.is_at_border(vertices.astype(np.float64)))
     _, first, same = np.unique(vertices[border], axis=0, return_index=True, return_inverse=True)
     target = np.arange(len(vertices))
     target[border] = border[first[same.ravel()]]

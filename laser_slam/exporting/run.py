@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import logging
+import math
+import zlib
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from laser_slam.config import Config, load_config
 from laser_slam.dependencies import import_open3d
@@ -80,6 +83,7 @@ class _Run:
     config: Config
     keyframes: Keyframes
     options: ExportOptions
+    masks: dict[int, bytes] = field(default_factory=dict)  # of keyframes: a few kB each
 
     def points(self, projected_from_world: Sim3 | None) -> Points:
         """Look how large the map is."""
@@ -106,11 +110,20 @@ class _Run:
     ) -> Iterator[DepthView]:
         """Read depth maps without the pixels that the map leaves out."""
         for window, rows in self._windows(wanted):
-            used = owned_views(_submap(window, [row for _, row in rows]), self.config.fusion)
-            for (key, row), filtered in zip(rows, used, strict=False):  # no views: no depth
-                view = self._view(trajectory, window, key, row)
-                depth = np.where(filtered.weight > 0, view.depth, np.float32(np.nan))
-                yield replace(view, depth=depth)
+            if any(key not in self.masks for key, _ in rows):
+                self._filter(window, rows)
+            for key, row in rows:
+                if key in self.masks:
+                    view = self._view(trajectory, window, key, row)
+                    is_used = _unpack(self.masks[key], view.depth.shape)
+                    depth = np.where(is_used, view.depth, np.float32(np.nan))
+                    yield replace(view, depth=depth)
+
+    def _filter(self, window: StoredWindow, rows: Sequence[tuple[int, int]]) -> None:
+        """Find the pixels that go into the map, and keep that: it takes most of the time."""
+        used = owned_views(_submap(window, [row for _, row in rows]), self.config.fusion)
+        for (key, _), filtered in zip(rows, used, strict=False):  # no views: no depth
+            self.masks[key] = zlib.compress(np.packbits(filtered.weight > 0).tobytes(), 1)
 
     def _originals(self) -> Originals:
         originals = load_originals(self.folder)
@@ -162,6 +175,11 @@ class _Run:
                     size,
                     window.colors[row],
                 )
+
+
+def _unpack(mask: bytes, size: tuple[int, ...]) -> NDArray[np.bool_]:
+    bits = np.unpackbits(np.frombuffer(zlib.decompress(mask), np.uint8), count=math.prod(size))
+    return bits.astype(np.bool_).reshape(size)
 
 
 def _submap(window: StoredWindow, rows: Sequence[int]) -> Submap:
