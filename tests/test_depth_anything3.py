@@ -14,7 +14,7 @@ from perfect import CONFIDENCE, SIZE, camera, seen
 from laser_slam.backbones import make_backbone
 from laser_slam.config import load_config
 from laser_slam.config.backbones import BackboneConfig
-from laser_slam.errors import DependencyError, WeightsError
+from laser_slam.errors import ConfigError, DependencyError, WeightsError
 from laser_slam.rectification import resize_image
 from laser_slam.sim3 import rotation_log
 from laser_slam.types import Prediction, WindowStatus
@@ -128,6 +128,11 @@ def test_without_the_package_one_line_says_how_to_get_it(monkeypatch: pytest.Mon
     ) as e:
         make_backbone(settings())
     assert "\n" not in str(e.value)
+
+
+def test_a_device_that_is_not_there_is_one_line() -> None:
+    with pytest.raises(ConfigError, match=r"backbone\.depth_anything3\.device: no 'tpu' here"):
+        make_backbone(settings("backbone.depth_anything3.device=tpu"))
 
 
 def test_a_model_that_cannot_be_had_is_one_line() -> None:

@@ -9,11 +9,11 @@ import pytest
 import torch
 from corridor import Corridor, true_intrinsics, view
 from numpy.typing import NDArray
-from perfect import CONFIDENCE, FOCALS, SIZE, Knowing, PerfectPi3, camera, seen, settings
+from perfect import CONFIDENCE, SIZE, Knowing, PerfectPi3, camera, seen, settings
 
-from laser_slam.backbones.feedforward import View, fit_camera, to_prediction, window_camera
+from laser_slam.backbones.feedforward import View, to_prediction
 from laser_slam.backbones.pi3 import Pi3Backbone
-from laser_slam.camera import rays, resize_intrinsics
+from laser_slam.camera import resize_intrinsics
 from laser_slam.config import load_config
 from laser_slam.errors import ConfigError, DegenerateGeometryError
 from laser_slam.pipeline import Pipeline
@@ -111,70 +111,6 @@ def test_a_whole_run_over_perfect_predictions_ends_at_the_truth(name: str, tmp_p
     # The corridor is rendered at pixels' centres; files keep depth to five parts in ten thousand.
     assert np.sqrt((error**2).sum(axis=1).mean()) < 3e-3
     assert results.report["windows"]["bridged"] == {}
-
-
-# --- the camera --------------------------------------------------------------------------------
-
-
-def cloud(seed: int, unit: float = 1.0) -> tuple[Any, Any]:
-    """Return points on the rays of the corridor's camera, and confidence."""
-    rng = np.random.default_rng(seed)
-    depth = unit * np.exp(rng.normal(size=(3, *SIZE)))
-    points = rays(camera(CENTRE), *SIZE) * depth[..., None]
-    return points.astype(np.float32), np.full(depth.shape, 0.5, np.float32)
-
-
-@pytest.mark.parametrize("unit", [0.01, 1.0, 100.0])
-def test_a_camera_is_found_in_any_unit_with_one_focal_length_for_each_axis(unit: float) -> None:
-    points, confidence = cloud(0, unit)
-    K = fit_camera(points, confidence, CENTRE)
-    assert K is not None
-    np.testing.assert_allclose(K, camera(CENTRE), rtol=1e-5)
-
-
-def test_a_camera_survives_a_third_of_wild_points_and_noise() -> None:
-    points, confidence = cloud(1)
-    rng = np.random.default_rng(2)
-    points[..., :2] += 0.01 * points[..., 2:] * rng.normal(size=points[..., :2].shape)
-    wild = rng.random(confidence.shape) < 0.3
-    points[wild] = 3 * rng.normal(size=(int(wild.sum()), 3))
-    K = fit_camera(points, confidence, CENTRE)
-    assert K is not None
-    np.testing.assert_allclose(K[[0, 1], [0, 1]], FOCALS, rtol=0.01)
-
-
-def test_a_camera_listens_to_confident_pixels() -> None:
-    points, confidence = cloud(3)
-    points[:, :, :40, :2] *= 2  # another focal length, in less than half of the pixels
-    points[:, :, 40:60, :2] *= 3
-    confidence[:, :, :60] = 0.2
-    K = fit_camera(points, confidence, CENTRE)
-    assert K is not None
-    np.testing.assert_allclose(K[[0, 1], [0, 1]], FOCALS, rtol=1e-4)
-
-
-def test_what_no_pinhole_camera_sees_has_none() -> None:
-    points, confidence = cloud(4)
-    assert (
-        fit_camera(points * np.array([-1, 1, 1], np.float32), confidence, CENTRE) is None
-    )  # mirrored
-    assert (
-        fit_camera(points * np.array([1e-3, 1, 1], np.float32), confidence, CENTRE) is None
-    )  # all ahead
-    assert fit_camera(np.full_like(points, np.nan), confidence, CENTRE) is None
-    assert fit_camera(points, np.zeros_like(confidence), CENTRE) is None
-    assert fit_camera(points[:, :2, :2], confidence[:, :2, :2], (0.5, 0.5)) is None
-
-
-def test_a_window_has_the_camera_that_most_frames_agree_on() -> None:
-    cameras = np.tile(camera(CENTRE), (7, 1, 1))
-    cameras[1, 0, 0] *= 3
-    cameras[2] = np.nan
-    cameras[3, 1, 1] = 0
-    found = window_camera(cameras)
-    assert found is not None
-    np.testing.assert_allclose(found, camera(CENTRE))
-    assert window_camera(cameras[2:4]) is None
 
 
 # --- wild numbers ------------------------------------------------------------------------------
@@ -297,6 +233,17 @@ def test_too_little_memory_is_one_line_that_says_what_to_lower() -> None:
     assert text.startswith("no memory for 9 frames of 126x70, about 0.0 GB of ")
     assert text.endswith(": lower windows.size to 6 (or auto), or lower backbone.pi3.side to 98")
     assert "\n" not in text
+
+
+def test_weights_that_do_not_fit_on_the_device_are_one_line() -> None:
+    class Heavy(PerfectPi3):
+        def to(self, device: torch.device) -> Any:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
+
+    backbone = Pi3Backbone(settings(), Heavy())  # type: ignore[arg-type]
+    expected = "no memory for the weights of pi3 on cpu, 3.8 GB: set backbone.pi3.dtype=bfloat16"
+    with pytest.raises(ConfigError, match=expected):
+        backbone.predict(images(), FRAMES, None)
 
 
 def test_another_error_of_the_network_stays_what_it_is() -> None:

@@ -37,6 +37,7 @@ class DepthAnything3Backbone:
         model: one that is used as it is; None: the one that the settings name.
 
     Raises:
+        ConfigError: the device is not there.
         DependencyError: the package is not installed.
         WeightsError: the model cannot be downloaded or read.
     """
@@ -92,7 +93,10 @@ class DepthAnything3Backbone:
 
 
 def _load(name: str, device: str) -> Any:
-    torch = import_torch()
+    import_torch()
+    from laser_slam.networks.placement import choose_placement  # noqa: PLC0415  (needs torch)
+
+    chosen = choose_placement(device, "float32", "backbone.depth_anything3").device
     try:
         package = import_module("depth_anything_3.api")  # not everyone has it
     except ImportError as error:
@@ -108,5 +112,4 @@ def _load(name: str, device: str) -> Any:
             f"backbone.depth_anything3.model: '{name}' cannot be had ({first}); give a folder "
             "that holds its config.json and model.safetensors, or a name on the Hugging Face hub"
         ) from error
-    chosen = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     return model.to(chosen).eval()

@@ -48,5 +48,5 @@ class DepthAnything3Config(Section):
     model: str = Field(
         "depth-anything/DA3-BASE", description="name on the Hugging Face hub, or a folder"
     )
-    device: str = Field("auto", description="cpu, cuda, cuda:1; auto: cuda if it is there")
+    device: str = Field("auto", description="cpu, cuda, cuda:1, mps; auto: the best that is there")
     side: int = Field(504, ge=28, le=4096, multiple_of=14, description="longer side of images, px")

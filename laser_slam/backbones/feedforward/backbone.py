@@ -158,8 +158,21 @@ class NetworkBackbone(ABC):
 
     @cached_property
     def _network(self) -> Any:
+        from laser_slam.networks.memory import Job  # noqa: PLC0415
+        from laser_slam.networks.placement import is_out_of_memory  # noqa: PLC0415
+
         network = self._given if self._weights is None else self._load(self._weights)
-        return network.to(self._placement.device)
+        try:
+            return network.to(self._placement.device)
+        except RuntimeError as error:
+            if not is_out_of_memory(error):
+                raise
+            size = Job(self.name, (1, 1), self._placement.dtype_name).weights_bytes() / 1e9
+            section = f"backbone.{self.name}"
+            raise ConfigError(
+                f"no memory for the weights of {self.name} on {self._placement.device}, "
+                f"{size:.1f} GB: set {section}.dtype=bfloat16 or {section}.device=cpu"
+            ) from error
 
     @cached_property
     def _hash(self) -> str:
