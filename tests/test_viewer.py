@@ -300,6 +300,17 @@ def test_candidates_join_their_cameras_accepted_apart_from_rejected(tmp_path: Pa
     assert sum("distrusts" in text for text in events) == 1
 
 
+def test_a_candidate_between_frames_that_were_never_shown_is_only_told(tmp_path: Path) -> None:
+    viewer = RerunViewer(FileSink(tmp_path / "a.rrd"), SMALL, FUSION)
+    submap = submap_of(chained, 0)
+    viewer.window(submap, None, TIMES_S[submap.prediction.frames])
+    viewer.loops([submap.world_from_window], [record_of(*LOOPS[0])])
+    viewer.close()
+    rows = read(tmp_path / "a.rrd")
+    assert rows["world/closures/accepted"][0].values["LineStrips3D:strips"] == []
+    assert len(rows["events"]) == 1
+
+
 def test_only_frame_and_time_are_timelines(tmp_path: Path) -> None:
     show(tmp_path / "a.rrd", 1)
     chunks = reading.RrdReader(tmp_path / "a.rrd").stream().to_chunks()
@@ -442,6 +453,12 @@ def test_the_command_writes_a_recording_where_there_is_no_display(
     assert f"rerun {run / 'run.rrd'}" in done.output.replace("\n", "")
     assert len(places_at_the_end(read(run / "run.rrd"))) == NUM_WINDOWS
     (run / "run.rrd").unlink()
+
+
+def test_a_file_and_a_page_at_once_are_refused(run: Path, tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["view", str(run), "--save", str(tmp_path / "a"), "--serve"])
+    assert done.exit_code == 1
+    assert "choose one" in done.output
 
 
 @pytest.mark.parametrize("is_run", [False, True])

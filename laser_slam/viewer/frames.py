@@ -101,7 +101,7 @@ class FrameLogger:
             ),
         )
         grey = np.rint(submap.prediction.confidence[row] * 255).astype(np.uint8)
-        confidence = encode_image(grey, width, quality)
+        confidence = encode_image(grey, max(1, width // 2), quality)  # it is smooth
         self._stream.log(
             at.CONFIDENCE, rerun.EncodedImage(contents=confidence, media_type="image/jpeg")
         )

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from laser_slam.errors import LaserSlamError
 from laser_slam.types import Image
 
-DEPTH_STEPS = 200  # of a PNG's depth in a median depth: fine enough to look at, small on disk
+DEPTH_STEPS = 128  # of a PNG's depth in a median depth: fine enough to look at, small on disk
 NUM_SCALES = 41  # colours of layer scales
 BORDER = 255  # between layers
 _REACH = 0.223  # log factor at the ends of the colours: 0.8 and 1.25

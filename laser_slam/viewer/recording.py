@@ -195,7 +195,11 @@ class RerunViewer:
             (at.ACCEPTED, _ACCEPTED, True),
             (at.REJECTED, _REJECTED, False),
         ):
-            some = [record for record in records if record.is_accepted == is_accepted]
+            some = [
+                record
+                for record in records
+                if record.is_accepted == is_accepted and self._knows(record)
+            ]
             lines = [
                 [self._center(record.frame_a), self._center(record.frame_b)] for record in some
             ]
@@ -214,6 +218,9 @@ class RerunViewer:
                 level = "INFO" if record.is_accepted else "DEBUG"
                 self._stream.log(at.EVENTS, rerun.TextLog(text, level=level))
         self._verdicts = [record.verdict for record in records]
+
+    def _knows(self, record: CandidateRecord) -> bool:
+        return record.frame_a in self._centers and record.frame_b in self._centers
 
     def _center(self, frame: int) -> Array:
         """Return where a frame's camera is in the world, as the windows lie now."""
