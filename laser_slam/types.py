@@ -275,9 +275,8 @@ class Cloud:
         points: (N, 3) in world units.
         colors: (N, 3) RGB uint8.
         weights: (N,) summed confidence of the pixels behind each point.
-        voxel_size: edge of the voxels that the points were averaged in, in world units, which
-            is about their distance to each other; 0: unknown.
-        normals: (N, 3) unit normals of the surface, towards the cameras; None: unknown.
+        voxel_size: edge of the voxels, about the points' distance, in world units; 0: unknown.
+        normals: (N, 3) unit normals towards the cameras; None: unknown.
 
     Raises:
         ValueError: shapes disagree or a point is not finite.
@@ -291,12 +290,11 @@ class Cloud:
 
     def __post_init__(self) -> None:
         """Check shapes and finiteness once, here."""
-        num = len(self.points)
-        if self.points.shape != (num, 3) or self.colors.shape != (num, 3):
+        num, shapes = len(self.points), {self.points.shape, self.colors.shape}
+        if shapes != {(num, 3)}:
             raise ValueError(f"points {self.points.shape}, colors {self.colors.shape}")
-        if self.weights.shape != (num,):
-            raise ValueError(f"a cloud of {num} points needs as many weights")
-        if self.normals is not None and self.normals.shape != (num, 3):
-            raise ValueError(f"points {self.points.shape}, normals {self.normals.shape}")
+        normals = self.points if self.normals is None else self.normals
+        if self.weights.shape != (num,) or normals.shape != (num, 3):
+            raise ValueError(f"a cloud of {num} points needs as many weights and normals")
         if not np.isfinite(self.points).all():
             raise ValueError("the points of a cloud must be finite")
