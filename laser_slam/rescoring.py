@@ -17,6 +17,7 @@ from laser_slam.results import (
     describe_paths,
     draw_trajectory,
     read_report,
+    rescale_windows,
     write_report,
     write_report_page,
 )
@@ -50,6 +51,7 @@ def rescore(folder: Path, truth_file: Path | None = None) -> dict[str, Any]:
     if errors.reason is not None:
         raise DatasetError(f"{truth_file or kept} cannot score {folder}: {errors.reason}")
     draw_trajectory(folder / "pictures", trajectory, truth, errors)
+    before = _metres_per_unit(report)
     report["trajectory"] = errors.numbers()
     chained, without = None, None
     if report.get("closures") and (folder / CHAINED_FILE).exists():
@@ -57,9 +59,29 @@ def rescore(folder: Path, truth_file: Path | None = None) -> dict[str, Any]:
         without = evaluate_trajectory(chained, truth)
         report["closures"]["trajectory_without"] = without.numbers()
     report["paths"] = describe_paths(trajectory, chained, truth, (errors, without))
+    if "records" in report.get("windows", {}):
+        now = _metres_per_unit(report | {"windows": {"unit": "m"}})
+        metres = (_ratio(now[0], before[0]), _ratio(now[1], before[1]))
+        report["windows"] = rescale_windows(
+            report["windows"], metres, has_same_truth=truth_file is None
+        )
     write_report(folder / "report.json", report)
     write_report_page(folder)
     return report
+
+
+def _metres_per_unit(report: dict[str, Any]) -> tuple[float | None, float | None]:
+    """Return the report's unit of windows per world unit, with the loops closed and without."""
+    if report.get("windows", {}).get("unit") != "m":
+        return 1.0, 1.0
+    closures = report.get("closures") or {}
+    parts = (report.get("trajectory"), closures.get("trajectory_without"))
+    with_loops, without = (part["scale"] if part else None for part in parts)
+    return with_loops, without
+
+
+def _ratio(new: float | None, old: float | None) -> float | None:
+    return new / old if new and old else None
 
 
 def read_trajectory(path: Path, times_s: Array | None) -> Trajectory:

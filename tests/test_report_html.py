@@ -462,6 +462,34 @@ def test_a_run_and_a_new_truth_rewrite_the_page(
     assert max(report["paths"]["truth"]["z"]) == pytest.approx(table[:, 3].max(), abs=0.01)
 
 
+def test_another_truth_moves_the_windows_scales_into_its_metres(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("draw_findings", "stages_picture"):
+        monkeypatch.setattr(laser_slam.pipeline, name, lambda *_: None)
+    folder = tmp_path / "run"
+    Pipeline(Corridor(36), CONFIG, folder, backbone=TrueBackbone()).run()
+    row = {"distance": 2.0, "scale": 3.0, "scale_without_loops": 4.0, "true_scale": 3.1}
+    change(folder, windows={"num": 1, "bridged": {}, "unit": "m", "records": [row]})
+    same = rescore(folder)["windows"]["records"][0]
+    assert {name: pytest.approx(value, rel=1e-5) for name, value in row.items()} == same
+    table = np.loadtxt(folder / "truth_tum.txt")
+    table[:, 1:4] *= 3
+    np.savetxt(tmp_path / "larger.txt", table)
+    moved = rescore(folder, tmp_path / "larger.txt")["windows"]
+    expected = {"distance": 6.0, "scale": 9.0, "scale_without_loops": 12.0}
+    found = moved["records"][0]
+    assert {name: pytest.approx(value, rel=1e-5) for name, value in expected.items()} == {
+        name: found[name] for name in expected
+    }
+    assert found["true_scale"] is None
+    change(folder, windows=moved | {"unit": "world units"}, closures=None)
+    again = rescore(folder)
+    scale = again["trajectory"]["scale"]
+    assert again["windows"]["records"][0]["scale"] == pytest.approx(9.0 * scale, rel=1e-5)
+    assert again["windows"]["unit"] == "m"
+
+
 # --- the numbers behind the charts --------------------------------------------------------------
 
 

@@ -19,7 +19,7 @@ from laser_slam.results.scores import (
     sample_views,
     score_views,
 )
-from laser_slam.results.windows import describe_course, describe_windows
+from laser_slam.results.windows import describe_course, describe_windows, rescale_windows
 
 __all__ = [
     "CHAINED_FILE",
@@ -42,6 +42,7 @@ __all__ = [
     "look_back",
     "place_window",
     "read_report",
+    "rescale_windows",
     "sample_views",
     "score_views",
     "write_findings",

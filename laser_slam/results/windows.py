@@ -65,6 +65,30 @@ def _describe_registration(registration: Registration | None) -> dict[str, Any] 
     }
 
 
+def rescale_windows(
+    windows: dict[str, Any], metres: tuple[float | None, float | None], *, has_same_truth: bool
+) -> dict[str, Any]:
+    """Put the windows' scales into the metres of another alignment to the truth.
+
+    Args:
+        windows: as ``describe_windows`` gives them.
+        metres: of the new alignment per unit that the windows have so far: of the path with
+            the loops closed, and of the one without; None: there is no such path.
+        has_same_truth: False: the true scales of the windows are no longer known.
+    """
+    factors = {"distance": metres[0], "scale": metres[0], "scale_without_loops": metres[1]}
+    records = []
+    for old in windows["records"]:
+        new = dict(old)
+        for name, factor in factors.items():
+            if new.get(name) is not None:
+                new[name] = None if factor is None else factor * new[name]
+        if not has_same_truth:
+            new["true_scale"] = None
+        records.append(new)
+    return {**windows, "unit": "m", "records": records}
+
+
 def describe_course(found: Findings) -> dict[str, Any]:
     """Keep the paths of a run and their errors; see ``describe_paths``."""
     loops = found.loops
