@@ -58,6 +58,16 @@ def test_any_size_becomes_whole_patches_of_about_its_aspect(rule: str) -> None:
         assert (max(height, width) == SIDE) if rule == "side" else (height * width <= PIXELS)
 
 
+@pytest.mark.parametrize("rule", ["side", "pixels"])
+def test_what_was_resized_is_not_resized_again(rule: str) -> None:
+    """Loop windows are predicted from the images of stored windows."""
+    rng = np.random.default_rng(1)
+    limit = SIDE if rule == "side" else PIXELS
+    for size in [(376, 1241), *rng.integers(300, 2400, (300, 2)).tolist()]:
+        once = network_size((size[0], size[1]), rule, limit)
+        assert network_size(once, rule, limit) == once
+
+
 @pytest.mark.parametrize("name", ["1241x376", "480x640"])
 def test_pixels_are_those_of_the_original_to_the_grey_level(name: str) -> None:
     with np.load(FOLDER / "resized.npz") as file:
