@@ -17,7 +17,10 @@ class ExportConfig(Section):
         2.0, gt=0, description="edge of the mesh's voxels, in voxels of the map"
     )
     mesh_truncation: float = Field(
-        6.0, ge=2, description="how far behind a surface the mesh may be wrong, in its voxels"
+        12.0,
+        ge=2,
+        description="depth of the band around surfaces in which depth maps are averaged, in the "
+        "mesh's voxels; less leaves holes in what is seen at a grazing angle",
     )
     mesh_min_views: float = Field(
         3.0, ge=0, description="frames that must have seen a piece of the mesh"
