@@ -17,6 +17,7 @@ from laser_slam.dependencies import import_open3d
 from laser_slam.errors import DatasetError, DegenerateGeometryError, RunFolderError
 from laser_slam.pose_graph import Link, PoseGraph, read_g2o
 from laser_slam.pose_graph.tangent import parent_sigmas
+from laser_slam.predicting.manifest import FRAMES_FILE, load_frames
 from laser_slam.rescoring import read_trajectory
 from laser_slam.results import CHAINED_FILE
 from laser_slam.sim3 import Sim3
@@ -101,6 +102,9 @@ class _Story:
         self._ending = _read_ending(run, self.config.viewer.max_points)
         self._loops = _read_loops(run, self.config)
         self._records: list[ClosureRecord] = []
+        self._known_times_s = None if self._ending is None else self._ending.path.times_s
+        if (run / FRAMES_FILE).exists():
+            self._known_times_s = load_frames(run)[0]
 
     def add(self, index: int, viewer: Viewer) -> None:
         """Tell of the next window, and of the loops that were closed once it was there."""
@@ -142,9 +146,9 @@ class _Story:
         return read_window(self._files, index, self.config)
 
     def _times_s(self, frames: NDArray[np.int64]) -> Array:
-        """Return seconds of frames; a run that was broken off has kept none."""
-        if self._ending is not None and frames[-1] < len(self._ending.path.times_s):
-            return self._ending.path.times_s[frames]
+        """Return seconds of frames; a run that was broken off early has kept none."""
+        if self._known_times_s is not None and frames[-1] < len(self._known_times_s):
+            return self._known_times_s[frames]
         return frames / self.config.dataset.fps
 
 

@@ -35,6 +35,7 @@ from laser_slam.dependencies import import_rerun
 from laser_slam.errors import DependencyError, LaserSlamError, RunFolderError
 from laser_slam.export import write_ply, write_tum
 from laser_slam.pose_graph import read_g2o, write_g2o
+from laser_slam.predicting.manifest import save_frames
 from laser_slam.results import CHAINED_FILE
 from laser_slam.sim3 import Sim3
 from laser_slam.slam import Slam
@@ -440,6 +441,11 @@ def test_a_run_that_was_broken_off_is_shown_as_far_as_it_came(run: Path, tmp_pat
     rows = read(tmp_path / "a.rrd")
     assert len(places_at_the_end(rows)) == 3
     assert "results/map" not in rows
+    assert [row.time_s for row in rows["frame/depth"][:3]] == pytest.approx([0.0, 0.1, 0.2])
+    save_frames(folder, 7 + TIMES_S, [])  # it broke off later, when all had been predicted
+    view_run(folder, FileSink(tmp_path / "b.rrd"))
+    times_s = [row.time_s for row in read(tmp_path / "b.rrd")["frame/depth"][:3]]
+    assert times_s == pytest.approx([7.0, 7.1, 7.2])
 
 
 def test_the_command_writes_a_recording_where_there_is_no_display(
