@@ -103,7 +103,7 @@ def test_without_network_one_line_says_which_file_to_bring(
     error = kinds.LocalEntryNotFoundError(
         "An error happened while trying to locate the file\non it"
     )
-    assert "it cannot be downloaded (An error happened" in told(monkeypatch, error)
+    assert "the Hugging Face hub cannot be reached (no network" in told(monkeypatch, error)
 
 
 def test_offline_mode_and_a_broken_line_read_alike(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,7 +120,7 @@ def test_the_real_library_without_network_is_told_in_one_line(
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     with pytest.raises(WeightsError) as caught:
         find_weights("", RELEASED)
-    assert "it cannot be downloaded (" in str(caught.value)
+    assert "the Hugging Face hub cannot be reached (no network" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

@@ -101,10 +101,10 @@ def _explain(error: Exception, checkpoint: Checkpoint, kinds: ModuleType) -> str
         return f"{repo} is gated: accept its terms at {checkpoint.url}, then 'hf auth login'"
     if isinstance(error, kinds.RepositoryNotFoundError):
         return f"the hub has no {repo}, or wants a login for it: 'hf auth login'"
-    # Not found on this machine is an offline hub's answer, not a missing file's.
-    if isinstance(error, kinds.EntryNotFoundError) and not isinstance(
-        error, kinds.LocalEntryNotFoundError
-    ):
+    # That nothing is found on this machine either is how the library says that it is offline.
+    if isinstance(error, kinds.LocalEntryNotFoundError):
+        return "the Hugging Face hub cannot be reached (no network, or HF_HUB_OFFLINE is set)"
+    if isinstance(error, kinds.EntryNotFoundError):
         return f"{repo} has no {checkpoint.file} any more"
     is_full = isinstance(error, OSError) and error.errno == errno.ENOSPC
     if is_full or "No space left" in str(error):
