@@ -183,6 +183,23 @@ def test_a_road_seen_at_a_grazing_angle_has_no_edges() -> None:
     np.testing.assert_allclose(cloud.points[:, 1], 1.65, atol=1e-5)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_normals_are_those_of_the_surface_and_face_the_camera(seed: int) -> None:
+    """A wall at any slant, in a window that is turned anyhow; single pixels have no neighbours."""
+    rng = np.random.default_rng(seed)
+    normal = np.array([*rng.uniform(-0.6, 0.6, 2), -1.0])
+    normal /= np.linalg.norm(normal)
+    depth = 3.0 / (rays(intrinsics_from_fov(70, *SIZE), *SIZE) @ -normal)
+    holes = rng.random(SIZE) < 0.3
+    submap = flat_submap(np.where(holes, np.nan, depth).astype(np.float32))
+    turn = rotation_exp(rng.normal(size=3))
+    cloud = fuse([replace(submap, world_from_window=Sim3(2.0, turn, rng.normal(size=3)))], SHARP)
+    assert cloud.normals is not None
+    np.testing.assert_allclose(np.linalg.norm(cloud.normals, axis=1), 1, atol=1e-6)
+    assert np.median(cloud.normals @ (turn @ normal)) > np.cos(np.radians(1))
+    assert (cloud.normals @ (turn @ normal)).min() > 0  # at worst the ray's direction
+
+
 def test_points_beyond_the_range_stay_out() -> None:
     depth = np.full(SIZE, 1.0, np.float32)
     depth[:, 30:] = 3.5

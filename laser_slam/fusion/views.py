@@ -16,6 +16,8 @@ from laser_slam.types import Submap
 
 Array = NDArray[np.float64]
 
+_REACH = 3  # pixels to each side that a normal is taken from: less noise than at the next ones
+
 
 class View(NamedTuple):
     """One frame as the kernels want it.
@@ -81,11 +83,11 @@ def owned_views(submap: Submap, config: FusionConfig) -> Iterator[View]:
 def surface_normal(view: Any, v: int, u: int) -> Any:
     """Return the unit normal of the surface at a pixel, in world axes, towards the camera.
 
-    It is square to the lines between the pixels before and after, across and down. Where these
-    are unknown on one side, the pixel itself takes their place; on both: the ray's direction.
+    It is square to the lines between the pixels ``_REACH`` before and after, across and down.
+    Where one of them is not used, the pixel itself takes its place; where both: the ray does.
     """
-    across = _line(view, v, u, 0, 1)
-    down = _line(view, v, u, 1, 0)
+    across = _line(view, v, u, 0, _REACH)
+    down = _line(view, v, u, _REACH, 0)
     nx = across[1] * down[2] - across[2] * down[1]
     ny = across[2] * down[0] - across[0] * down[2]
     nz = across[0] * down[1] - across[1] * down[0]
@@ -111,7 +113,7 @@ def _ray(view: Any, v: int, u: int) -> Any:
 
 @njit(cache=True, nogil=True, inline="always")
 def _line(view: Any, v: int, u: int, down: int, across: int) -> Any:
-    """Return the vector from the pixel before to the pixel after, as far as they are used."""
+    """Return the vector from a pixel before to a pixel after, as far as they are used."""
     height, width = view.depth.shape
     v0, u0, v1, u1 = v - down, u - across, v + down, u + across
     if v0 < 0 or u0 < 0 or not view.weight[v0, u0] > 0:
