@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import weakref
 from contextlib import nullcontext
+from pathlib import Path
 from typing import Any
 
+import memory_table
 import pytest
 import torch
 from torch import Tensor, nn
@@ -25,6 +27,7 @@ from laser_slam.networks.trunk import keeps_full_precision
 from laser_slam.networks.vggt import Vggt, VggtConfig
 
 KITTI = (154, 518)
+DOCUMENT = (Path(__file__).parents[1] / "docs" / "backbones.md").read_text().splitlines()
 
 
 class Count(TorchDispatchMode):  # type: ignore[no-untyped-call]
@@ -137,6 +140,12 @@ def test_advice_names_a_size_that_fits_and_a_side_that_does() -> None:
     fits = job.largest_window(1 << 30, has_weights=True)
     assert f"lower windows.size to {fits} (or auto), or lower backbone.vggt.side to" in text
     assert "windows.size" not in advise(job, 4, 1 << 28, "backbone.vggt")
+
+
+def test_the_documents_tables_are_those_of_the_formula(capsys: pytest.CaptureFixture[str]) -> None:
+    memory_table.main()
+    for line in capsys.readouterr().out.splitlines():
+        assert line in DOCUMENT
 
 
 # --- windows.size=auto -------------------------------------------------------------------------
