@@ -579,8 +579,9 @@ def test_a_run_of_an_older_version_says_what_is_missing(
 
 
 def test_missing_originals_are_named_before_anything_is_written(run: Path, tmp_path: Path) -> None:
+    options = ExportOptions(photos_from=tmp_path)
     with pytest.raises(DatasetError, match=r"no original image .*shot-0.png and \d+ more; pass"):
-        export(run, "nerfstudio", tmp_path, photos_from=tmp_path)
+        export_run(run, ["tum", "las", "nerfstudio"], tmp_path / "out", options)
     assert not list(tmp_path.iterdir())
 
 

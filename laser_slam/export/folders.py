@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from laser_slam.errors import RunFolderError
+from laser_slam.store.files import flush
 
 MARK = ".laser-slam-export"
 
@@ -30,6 +31,9 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         partial.mkdir()
         yield partial
         (partial / MARK).touch()
+        for file in partial.rglob("*"):
+            if file.is_file() and not file.is_symlink():
+                flush(file)
         if path.exists():
             path.replace(old)
         partial.replace(path)

@@ -44,15 +44,6 @@ def export_laz(path: Path, source: Source) -> None:
     _write(path, source.some_points(), compress=True)
 
 
-def check_las(_source: Source) -> None:
-    """Say before the work what is missing for LAS and LAZ.
-
-    Raises:
-        DependencyError: laspy, lazrs or pyproj is not installed.
-    """
-    import_laspy()
-
-
 def _write(path: Path, points: Points, *, compress: bool) -> None:
     laspy = import_laspy()
     header = _header(laspy, points)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from laser_slam.errors import RunFolderError
 from laser_slam.export.base import Source
+from laser_slam.export.checks import has_graph
 from laser_slam.store import atomic_write
 from laser_slam.types import Trajectory
 
@@ -83,13 +83,9 @@ def export_g2o(path: Path, source: Source) -> None:
     Raises:
         RunFolderError: the run has none, or the file cannot be written.
     """
-    if source.graph is None:
-        raise RunFolderError(
-            f"{source.name} has no pose graph: it was run with closures.enabled=false; "
-            "export its trajectory instead (kitti, tum, euroc)"
-        )
+    has_graph(source)
     with atomic_write(path) as partial:
-        shutil.copyfile(source.graph, partial)
+        shutil.copyfile(str(source.graph), partial)
 
 
 def _quat_xyzw(trajectory: Trajectory) -> NDArray[np.float64]:

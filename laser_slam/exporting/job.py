@@ -48,6 +48,9 @@ def export_run(
     targets = _targets(run, names, out)
     for name, target in targets.items():
         _check_target(target, FORMATS[name].is_folder, force=options.force)
+    for check in dict.fromkeys(FORMATS[name].check for name in names):
+        if check is not None:
+            check(source)
     for name, target in targets.items():
         _make_parent(target)
         writers[name](target, source)

@@ -8,7 +8,7 @@ import math
 import zlib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from itertools import groupby
 from pathlib import Path
 
@@ -57,10 +57,10 @@ def open_run(run: Path, options: ExportOptions) -> Source:
         str(run),
         config.export,
         trajectory,
-        partial(opened.points, projected_from_world),
+        cache(partial(opened.points, projected_from_world)),
         partial(opened.views, trajectory),
         partial(opened.surfaces, trajectory),
-        opened.photos,
+        cache(opened.photos),
         graph if graph.exists() else None,
     )
 

@@ -32,7 +32,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
     try:
         yield partial
-        _flush(partial)
+        flush(partial)
         partial.replace(path)
     except OSError as error:
         advice = _ADVICE.get(error.errno or 0, "choose another folder")
@@ -43,7 +43,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
             partial.unlink()
 
 
-def _flush(path: Path) -> None:
+def flush(path: Path) -> None:
+    """Wait until a file's content is on the disk."""
     with path.open("rb+") as file:
         os.fsync(file.fileno())
 

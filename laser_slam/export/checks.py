@@ -1,0 +1,54 @@
+"""What each format needs of a run: asked before anything is written."""
+
+from __future__ import annotations
+
+from laser_slam.dependencies import import_laspy
+from laser_slam.errors import RunFolderError
+from laser_slam.export.base import Source
+from laser_slam.export.las import parse_crs
+
+
+def has_points(source: Source) -> None:
+    """Ask for a map that is not empty.
+
+    Raises:
+        RunFolderError: it is empty, or its files are damaged.
+    """
+    source.some_points()
+
+
+def can_be_las(source: Source) -> None:
+    """Ask for the packages that write LAS and LAZ, a map, and a coordinate system that exists.
+
+    Raises:
+        DependencyError: a package is not installed.
+        RunFolderError: the map is empty, or its files are damaged.
+        ConfigError: the coordinate system is unknown.
+    """
+    import_laspy()
+    crs = source.some_points().crs
+    if crs is not None:
+        parse_crs(crs)
+
+
+def has_photos(source: Source) -> None:
+    """Ask for the images of the keyframes.
+
+    Raises:
+        DatasetError: they are missing.
+        RunFolderError: the run does not say which they are.
+    """
+    source.photos()
+
+
+def has_graph(source: Source) -> None:
+    """Ask for the pose graph.
+
+    Raises:
+        RunFolderError: the run has none.
+    """
+    if source.graph is None:
+        raise RunFolderError(
+            f"{source.name} has no pose graph: it was run with closures.enabled=false; "
+            "export its trajectory instead (kitti, tum, euroc)"
+        )
