@@ -6,6 +6,7 @@ import logging
 import resource
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -37,6 +38,7 @@ from typer.testing import CliRunner
 
 import laser_slam.pipeline
 from laser_slam import dependencies
+from laser_slam.camera import intrinsics_matrix
 from laser_slam.cli import app
 from laser_slam.config import load_config
 from laser_slam.dependencies import import_open3d
@@ -47,8 +49,11 @@ from laser_slam.errors import (
     LaserSlamError,
     RunFolderError,
 )
-from laser_slam.export import FORMATS, find_writer
+from laser_slam.export import FORMATS, Camera, Photo, Photos, find_writer
+from laser_slam.export.colmap import export_colmap
+from laser_slam.export.nerfstudio import export_nerfstudio
 from laser_slam.exporting import ExportOptions, PhotoKind, export_run
+from laser_slam.exporting.run import open_run
 from laser_slam.pipeline import Pipeline
 from laser_slam.sim3 import Sim3, rotation_exp
 from laser_slam.store.keyframes import IMAGES_FILE, load_keyframes, save_originals
@@ -362,6 +367,41 @@ def test_a_video_gives_its_keyframes(run: Path, tmp_path: Path) -> None:
     frame = int(load_keyframes(run).frames[5])
     shown = np.asarray(Pillow.open(folder / "images" / f"{frame:06d}.jpg")).astype(int)
     assert np.median(np.abs(shown - frames[frame])) < 6
+
+
+def test_images_that_exif_data_turns_come_out_upright(pinhole_run: Path, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    exif = Pillow.Exif()
+    exif[0x0112] = 6  # stored a quarter turn to the left
+    upright = [frame.image for frame in PhotographedCorridor(None, NUM_FRAMES, NO_BEND).frames()]
+    for index, image in enumerate(upright):
+        assert image is not None
+        stored = Pillow.fromarray(np.ascontiguousarray(np.rot90(image)))
+        stored.save(photos / f"{index}.jpg", exif=exif, quality=95)
+    folder = export(pinhole_run, "nerfstudio", tmp_path, photos_from=photos)
+    content = json.loads((folder / "transforms.json").read_text())
+    frame = int(load_keyframes(pinhole_run).frames[-1])
+    shown = np.asarray(Pillow.open(folder / content["frames"][-1]["file_path"])).astype(int)
+    assert shown.shape[:2] == (content["h"], content["w"]) == SIZE
+    assert np.median(np.abs(shown - upright[frame])) < 5
+
+
+def test_each_image_names_its_camera_where_there_are_several(run: Path, tmp_path: Path) -> None:
+    cameras = [Camera((40, 60), intrinsics_matrix(f, f, 30, 20), np.zeros(4)) for f in (50, 60)]
+    shots = [Photo(f"{i}.png", i, i % 2, np.eye(4)) for i in range(4)]
+    source = replace(
+        open_run(run, ExportOptions()),
+        photos=lambda: Photos(cameras, shots, lambda folder: (folder / "0.png").touch()),
+    )
+    export_colmap(tmp_path / "colmap", source)
+    model = pycolmap.Reconstruction(str(tmp_path / "colmap" / "sparse" / "0"))
+    focals = {image.name: image.camera.params[0] for image in model.images.values()}
+    assert focals == {"0.png": 50, "1.png": 60, "2.png": 50, "3.png": 60}
+    export_nerfstudio(tmp_path / "nerfstudio", source)
+    content = json.loads((tmp_path / "nerfstudio" / "transforms.json").read_text())
+    assert [frame["fl_x"] for frame in content["frames"]] == [50, 60, 50, 60]
+    assert "fl_x" not in content
 
 
 # --- depth --------------------------------------------------------------------------------------
