@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict, defaultdict
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
 from laser_slam.config import FusionConfig
 from laser_slam.fusion.grid import Located, VoxelGrid, Voxels
 from laser_slam.fusion.keys import HALF, cells_of, corner_of, keys_of, place_of, tile_of
-from laser_slam.fusion.views import owned_views
+from laser_slam.fusion.views import View, owned_views
 from laser_slam.store import Place, SumFiles, TileSums
 from laser_slam.types import Submap
 
@@ -54,7 +56,7 @@ class Accumulator:
         Raises:
             RunFolderError: a tile could not be written or read.
         """
-        for view in owned_views(submap, self._config):
+        for view in _ahead(owned_views(submap, self._config)):
             located = self._grid.locate(view, self._config.stride)
             self._num_outside += located.num_outside
             places = self._places(located)
@@ -119,6 +121,15 @@ class Accumulator:
             cells = cells_of(voxels.keys, corner_of(place, bits))
             self._aside.save(place, TileSums(cells, voxels.sums, voxels.views), 1 << bits)
             del self._active[place]
+
+
+def _ahead(views: Iterator[View]) -> Iterator[View]:
+    """Make the next view while one is added: both take about as long, and no lock of Python's."""
+    with ThreadPoolExecutor(1, thread_name_prefix="views") as pool:
+        upcoming = pool.submit(next, views, None)
+        while (view := upcoming.result()) is not None:
+            upcoming = pool.submit(next, views, None)
+            yield view
 
 
 def reach(submap: Submap, config: FusionConfig, voxel_size: float) -> set[Place]:
