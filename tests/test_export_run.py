@@ -543,6 +543,22 @@ def test_a_map_without_colours_becomes_grey_with_a_warning(
     assert set(np.asarray(las.green)) == {128 * 257}
 
 
+@pytest.mark.parametrize("kept", [0, 30, 100_000])
+def test_a_map_that_is_cut_short_is_damaged_not_smaller(
+    run: Path, tmp_path: Path, kept: int
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy, ignore=shutil.ignore_patterns("tiles"))
+    whole = laspy.read(export(copy, "las", tmp_path))
+    assert len(whole.points) == len(the_map(run)[0])
+    (copy / "map.ply").write_bytes((run / "map.ply").read_bytes()[:kept])
+    with pytest.raises(RunFolderError, match=r"map.ply is damaged; run again"):
+        export(copy, "ply", tmp_path)
+    (copy / "map.ply").unlink()
+    with pytest.raises(RunFolderError, match=r"map.ply is missing; run again"):
+        export(copy, "ply", tmp_path)
+
+
 @pytest.mark.parametrize("name", sorted(set(FORMATS) - {"g2o"}))
 def test_no_space_leaves_nothing_behind(run: Path, tmp_path: Path, name: str) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

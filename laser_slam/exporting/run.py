@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 import zlib
 from collections.abc import Collection, Iterator, Sequence
@@ -16,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.config import Config, load_config
-from laser_slam.dependencies import import_open3d
 from laser_slam.errors import RunFolderError
 from laser_slam.export import DepthView, Photos, Points, Source, survey
 from laser_slam.exporting.georeference import place, read_georeference
 from laser_slam.exporting.options import ExportOptions
 from laser_slam.exporting.photos import Stored, gather_photos, move_originals
+from laser_slam.exporting.ply import read_ply
 from laser_slam.fusion.views import owned_views
 from laser_slam.rescoring import read_trajectory
 from laser_slam.sim3 import Sim3
@@ -29,12 +28,6 @@ from laser_slam.slam import StoredWindow, read_window
 from laser_slam.store import TileFiles, WindowFiles
 from laser_slam.store.keyframes import Keyframes, Originals, load_keyframes, load_originals
 from laser_slam.types import Cloud, Submap, Trajectory
-
-GREY = 128  # of points without colours
-
-logger = logging.getLogger(__name__)
-
-_EMPTY = Cloud(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.float32))
 
 
 def open_run(run: Path, options: ExportOptions) -> Source:
@@ -200,7 +193,7 @@ def _portions(run: Path) -> Iterator[Cloud]:
     if tiles.folder.is_dir():
         yield from tiles.clouds()
         return
-    yield _read_ply(run / "map.ply", _voxel_size(run / "report.json"))
+    yield from read_ply(run / "map.ply", _voxel_size(run / "report.json"))
 
 
 def _voxel_size(path: Path) -> float:
@@ -208,31 +201,3 @@ def _voxel_size(path: Path) -> float:
         return float(json.loads(path.read_text(encoding="utf-8"))["map"]["voxel_size"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise RunFolderError(f"{path} is no report of a run; run again") from error
-
-
-def _read_ply(path: Path, voxel_size: float) -> Cloud:
-    """Read a cloud with whatever it has of colours, normals and weights.
-
-    Raises:
-        RunFolderError: the file is missing or damaged.
-    """
-    if not path.is_file():
-        raise RunFolderError(f"{path} is missing; run again")
-    open3d = import_open3d()
-    with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
-        columns = open3d.t.io.read_point_cloud(str(path)).point
-    if "positions" not in columns:
-        return _EMPTY
-    points = columns["positions"].numpy().astype(np.float64)
-    colors = np.full((len(points), 3), GREY, np.uint8)
-    if "colors" in columns:
-        colors = columns["colors"].numpy()
-        if colors.dtype != np.uint8:
-            colors = np.rint(255 * colors.clip(0, 1)).astype(np.uint8)
-    else:
-        logger.warning("%s has no colours: its points become grey", path)
-    weights = np.ones(len(points), np.float32)
-    if "weight" in columns:
-        weights = columns["weight"].numpy()[:, 0]
-    normals = columns["normals"].numpy() if "normals" in columns else None
-    return Cloud(points, colors, weights, voxel_size, normals)
