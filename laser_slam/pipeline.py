@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable
+from contextlib import closing
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -22,35 +24,42 @@ from laser_slam.camera import resize_intrinsics
 from laser_slam.closures import Tools, make_matcher
 from laser_slam.config import Config
 from laser_slam.datasets.base import Dataset
-from laser_slam.fusion import fuse
 from laser_slam.predicting import make_source, settle
 from laser_slam.report import stages_picture
 from laser_slam.results import (
     Findings,
+    RawCloud,
     Results,
+    describe_course,
     describe_layers,
     describe_loops,
     describe_sequence,
     describe_system,
+    describe_windows,
     draw_findings,
+    fuse_run,
+    list_keyframes,
     look_back,
     sample_views,
     score_views,
     write_findings,
     write_report,
+    write_report_page,
 )
 from laser_slam.sim3 import interpolate_poses
 from laser_slam.slam import LoopCloser, Slam, StoredWindow, read_window
-from laser_slam.store import WindowFiles, link_latest, new_run_folder
-from laser_slam.types import (
-    Cloud,
-    Image,
-    Prediction,
-    Submap,
-    Trajectory,
-)
+from laser_slam.store import TileFiles, WindowFiles, link_latest, new_run_folder
+from laser_slam.store.keyframes import save_originals
+from laser_slam.types import Image, Prediction, Trajectory
+from laser_slam.viewer import NullViewer, Viewer
 
+IN_MEMORY = 15_000_000  # points of the map that a Python user gets; of a larger one an even part
 logger = logging.getLogger(__name__)
+
+
+def no_viewer(_folder: Path, _config: Config) -> Viewer:
+    """Watch nothing."""
+    return NullViewer()
 
 
 class Pipeline:
@@ -71,6 +80,7 @@ class Pipeline:
         *,
         backbone: Backbone | None = None,
         on_progress: Progress = no_progress,
+        make_viewer: Callable[[Path, Config], Viewer] = no_viewer,
     ) -> None:
         """Prepare a run; nothing is read or written yet.
 
@@ -81,6 +91,7 @@ class Pipeline:
                 None: ``runs/<sequence>-<time>``, with ``runs/latest`` linking to it.
             backbone: the source of depth and poses; None: the one that the settings name.
             on_progress: called with a stage's name, how much is done and of how much.
+            make_viewer: gives who watches the run, from its folder and settings.
         """
         self._dataset = dataset
         self._info = dataset.info
@@ -94,6 +105,8 @@ class Pipeline:
         self.source = make_source(dataset, config, self.folder, backbone, self._clock, on_progress)
         self._files = WindowFiles(self.folder)
         self._closer = self._make_closer()
+        self._make_viewer = make_viewer
+        self._viewer: Viewer = NullViewer()
 
     def run(self) -> Results:
         """Map the sequence.
@@ -102,7 +115,8 @@ class Pipeline:
             LaserSlamError: the input, the settings or the folder cannot be used.
         """
         self.source.open()
-        with run_log(self.folder / "run.log") as warnings:
+        self._viewer = self._make_viewer(self.folder, self._config)
+        with run_log(self.folder / "run.log") as warnings, closing(self._viewer):
             with self._clock.stage("calibrate"):
                 self.source.calibrate()
             for prediction, colors in self.source.windows():
@@ -113,15 +127,17 @@ class Pipeline:
             with self._clock.stage("layers"):
                 self._slam.smooth_layers(self._files)
             trajectory = self._trajectory()
-            cloud = self._fuse()
+            tiles, raw = self._fuse()
             with self._clock.stage("evaluate"):
-                found = self._evaluate(trajectory, cloud)
+                found = self._evaluate(trajectory, tiles, raw)
             self._write(found)
             report = self._report(found, warnings)
             write_report(self.folder / "report.json", report)
+            write_report_page(self.folder)
+            self._show(found)
         if self._is_named_here:
             link_latest(self.folder)
-        return Results(self.folder, trajectory, cloud, report)
+        return Results(self.folder, trajectory, found.cloud, report)
 
     def _make_closer(self) -> LoopCloser | None:
         if not self._config.closures.enabled:
@@ -136,12 +152,28 @@ class Pipeline:
         if self._slam.layers is not None:
             with self._clock.stage("store"):
                 self._files.save_layers(submap.index, self._slam.layers)
+        with self._clock.stage("view"):
+            times_s = [self.source.input.times_s[frame] for frame in prediction.frames]
+            self._viewer.window(submap, self._slam.layers, np.array(times_s))
         if self._closer is not None:
             with self._clock.stage("places"):
                 self._closer.add(submap.prediction, colors)
+        self._show_loops()
         size = (prediction.depth.shape[1], prediction.depth.shape[2])
         self._intrinsics.append(resize_intrinsics(prediction.intrinsics[0], size, self._info.size))
         self._on_progress("mapping", int(prediction.frames[-1]) + 1, self._info.num_frames)
+
+    def _show_loops(self) -> None:
+        """Show where windows are by now, and what became of the loop candidates."""
+        with self._clock.stage("view"):
+            places = [node.world_from_window for node in self._slam.nodes]
+            self._viewer.loops(places, self._closer.records if self._closer else [])
+
+    def _show(self, found: Findings) -> None:
+        self._show_loops()
+        with self._clock.stage("view"):
+            chained = found.loops.chained if found.loops else found.trajectory
+            self._viewer.results(found.cloud, found.trajectory, chained)
 
     def _trajectory(self, *, closed: bool = True) -> Trajectory:
         """Give every frame of the input a pose, those between keyframes by interpolation."""
@@ -151,22 +183,24 @@ class Pipeline:
             world_from_cam = interpolate_poses(times_s, key.times_s, key.world_from_cam)
         return Trajectory(np.arange(len(times_s)), times_s, world_from_cam)
 
-    def _submaps(self) -> Iterator[Submap]:
-        """Read the stored windows back, one at a time, at their final places."""
-        nodes = self._slam.nodes
-        for node, places in zip(nodes, self._slam.frame_places(), strict=True):
-            window = self._load(node.index)
-            yield node.submap(window.corrected, window.colors, places)
-            self._on_progress("fusing", node.index + 1, len(nodes))
+    def _fuse(self) -> tuple[TileFiles, RawCloud]:
+        keyframes = list_keyframes(self._slam)
+        raw = RawCloud(len(keyframes.frames))
 
-    def _fuse(self) -> Cloud:
+        def load(index: int) -> StoredWindow:
+            with self._clock.stage("load"):
+                return self._load(index)
+
+        def watch(done: int, num: int) -> None:
+            self._on_progress("fusing", done, num)
+
         with self._clock.stage("fuse"):
-            cloud = fuse(self._clock.timed("load", self._submaps()), self._config.fusion)
-        if not len(cloud.points):
+            tiles = fuse_run(self.folder, keyframes, self._config, load, watch, raw.add)
+        if not tiles.num_points:
             logger.warning("the map is empty: nothing was seen with confidence")
-        return cloud
+        return tiles, raw
 
-    def _evaluate(self, trajectory: Trajectory, cloud: Cloud) -> Findings:
+    def _evaluate(self, trajectory: Trajectory, tiles: TileFiles, raw: RawCloud) -> Findings:
         """Compare with the truth, as far as there is one, and with the run without its loops."""
         truth, config = self._info.truth, self._config
         views = list(sample_views(self._slam.nodes, self._load, config.run.samples))
@@ -175,7 +209,9 @@ class Pipeline:
         loops = None
         if self._closer is not None:
             loops = look_back(self._closer, self._slam, self._trajectory(closed=False), truth)
-        return Findings(trajectory, cloud, scores, loops, truth)
+        unfiltered = raw.cloud(tiles.voxel_size)
+        cloud = tiles.cloud(IN_MEMORY)
+        return Findings(trajectory, cloud, scores, loops, truth, tiles, unfiltered)
 
     def _true_depth(self, frame: int) -> NDArray[np.float32] | None:
         truth = self._dataset.true_depth(frame)
@@ -184,24 +220,27 @@ class Pipeline:
     def _write(self, found: Findings) -> None:
         with self._clock.stage("write"):
             write_findings(self.folder, found, self._slam)
+            save_originals(self.folder, self._info, self.source.calibration)
         with self._clock.stage("pictures"):
             draw_findings(self.folder / "pictures", found, self._slam.nodes, self._files)
         stages_picture(self.folder / "pictures" / "stages.png", dict(self._clock.wall_s))
 
     def _report(self, found: Findings, warnings: list[str]) -> dict[str, Any]:
-        scores, cloud = found.scores, found.cloud
+        scores = found.scores
         return {
             "sequence": describe_sequence(self._info, self.source.calibration, self._intrinsics),
             "frames": {**self.source.input.counts(), "keyframes": self._slam.num_keyframes},
-            "windows": {"num": len(self._slam.nodes), "bridged": self._slam.bridged},
+            "windows": describe_windows(self._slam, found),
+            "paths": describe_course(found),
             "trajectory": scores.trajectory.numbers() if scores.trajectory else None,
             "depth": scores.depth,
             "depth_without_layers": scores.raw_depth,
-            "layers": describe_layers(self._slam.nodes),
+            "layers": describe_layers(self._slam.nodes, self._files),
             "closures": describe_loops(found.loops),
-            "map": {"num_points": len(cloud.points), "voxel_size": cloud.voxel_size},
+            "map": {"num_points": found.num_points, "voxel_size": found.cloud.voxel_size},
             "warnings": warnings,
             **self._clock.report(len(self.source.input.times_s)),
+            "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
             **describe_system(),
             "settings": self._config.model_dump(mode="json"),
         }

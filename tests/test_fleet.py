@@ -14,7 +14,8 @@ from laser_slam.config import Config, load_config
 from laser_slam.datasets.synthetic.drive import SyntheticDrive
 from laser_slam.errors import ConfigError, LaserSlamError, WeightsError
 from laser_slam.predicting import Fleet, Job
-from laser_slam.predicting.fleet import Crew, Worker, _cause, _needs
+from laser_slam.predicting.cluster import divide
+from laser_slam.predicting.fleet import Crew, Worker, _cause
 from laser_slam.store import load_prediction
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'laser-slam[ray]'")
@@ -158,13 +159,13 @@ def test_workers_fill_the_cluster(
     has: dict[str, float], fleet: Fleet, name: str, wanted: tuple[int, int, int]
 ) -> None:
     config = load_config(assignments=[f"backbone.name={name}"]).backbone
-    needs, num = _needs(has, fleet, config)
+    needs, num = divide(has, fleet, config)
     assert (num, needs["num_cpus"], needs["num_gpus"]) == wanted
 
 
 def test_more_workers_than_there_is_room_for_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"5 workers of 1 cores .* lower --workers or --cores"):
-        _needs({"CPU": 4}, Fleet(num_workers=5, cores=1), CONFIG.backbone)
+        divide({"CPU": 4}, Fleet(num_workers=5, cores=1), CONFIG.backbone)
 
 
 def test_a_bug_in_a_worker_is_told_in_one_line() -> None:

@@ -22,17 +22,28 @@ predict_app = typer.Typer(
 )
 
 
+ViewOption = Annotated[
+    bool, typer.Option("--view", help="Watch it in rerun; without a display: in RUN/run.rrd.")
+]
+
+
 @dataclass(frozen=True)
 class MapOptions(RunOptions):
     """Options of a whole run."""
 
+    view: ViewOption = False
+
     def work(self, dataset: Dataset, config: Config) -> None:
         """Map the data set."""
         from laser_slam.console import print_summary, progress_display
-        from laser_slam.pipeline import Pipeline
+        from laser_slam.pipeline import Pipeline, no_viewer
+        from laser_slam.viewing import live_viewer
 
+        viewer = live_viewer if self.view else no_viewer
         with progress_display(quiet=self.quiet) as on_progress:
-            pipeline = Pipeline(dataset, config, self.out, on_progress=on_progress)
+            pipeline = Pipeline(
+                dataset, config, self.out, on_progress=on_progress, make_viewer=viewer
+            )
             try:
                 results = pipeline.run()
             except KeyboardInterrupt as error:

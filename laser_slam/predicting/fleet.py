@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import socket
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -15,12 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.backbones import is_on_cpu, make_backbone
+from laser_slam.backbones import make_backbone
 from laser_slam.backbones.base import Backbone
 from laser_slam.config import BackboneConfig
 from laser_slam.dependencies import import_ray, num_threads
 from laser_slam.errors import ConfigError, LaserSlamError
 from laser_slam.predicting.backbone_source import BackboneSource
+from laser_slam.predicting.cluster import Fleet, connect, divide, last_line
 from laser_slam.rectification import reduce_images
 from laser_slam.store import pack_window
 from laser_slam.types import Window
@@ -28,27 +28,10 @@ from laser_slam.types import Window
 # Windows in a row that go to one worker, where the backbone remembers: it starts afresh with each
 # stretch, whoever does it, so that the outcome does not depend on how many workers there are.
 STRETCH = 8
-CORES = 2  # of a worker without GPU
 MAX_TRIES = 3  # workers that may be lost over the same windows
-REACH_S = 10.0
 START_S = 600.0  # a worker may read gigabytes of weights
 QUEUED = 2  # stretches per worker, so that none waits for the next
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Fleet:
-    """Which workers there are to be.
-
-    Attributes:
-        address: of a Ray cluster, such as ``auto`` or ``ray://head:10001``; None: this machine.
-        num_workers: None: one for each GPU, or as many as the cores allow.
-            cores: that each worker gets; None: all that there are for each GPU, without GPUs 2.
-    """
-
-    address: str | None = None
-    num_workers: int | None = None
-    cores: int | None = None
 
 
 @dataclass
@@ -117,8 +100,8 @@ class Crew:
         self._tasks: dict[Any, tuple[Any, _Task]] = {}  # what comes of it -> worker, task
         self.workers: list[Any] = []
         if not self._is_guest:
-            _connect(self._ray, fleet.address)
-        self._options, num = _needs(self._ray.cluster_resources(), fleet, config)
+            connect(self._ray, fleet.address)
+        self._options, num = divide(self._ray.cluster_resources(), fleet, config)
         self.workers += [self._start() for _ in range(num)]
 
     def __enter__(self) -> Crew:
@@ -203,8 +186,8 @@ class Crew:
         first, last = task.windows[0].index, task.windows[-1].index
         if task.num_tries == MAX_TRIES:
             raise LaserSlamError(
-                f"{MAX_TRIES} workers were lost over windows {first} to {last} ({_line(error)}); "
-                "see Ray's log; give each worker more memory, or lower windows.size"
+                f"{MAX_TRIES} workers were lost over windows {first} to {last} "
+                f"({last_line(error)}); see Ray's log; give each worker more memory, or lower windows.size"
             ) from error
         logger.warning("a worker was lost; windows %d to %d are done again", first, last)
         if lost in self.workers:
@@ -255,63 +238,9 @@ def _stretches(windows: Iterable[Window], length: int) -> Iterator[list[Window]]
         yield stretch
 
 
-def _connect(ray: Any, address: str | None) -> None:
-    """Join a cluster, or start one of this machine alone."""
-    _refuse_unreachable(address)
-    quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
-    try:
-        if address is None:
-            ray.init(include_dashboard=False, **quiet)
-        else:
-            ray.init(address=address, **quiet)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        where = "on this machine" if address is None else f"at {address}"
-        raise ConfigError(
-            f"--address: no Ray cluster {where} ({_line(error)}); start one with 'ray start --head'"
-        ) from error
-
-
-def _refuse_unreachable(address: str | None) -> None:
-    """Say at once what Ray finds out after many minutes."""
-    host, _, port = (address or "").removeprefix("ray://").rpartition(":")
-    if not port.isdecimal():
-        return
-    try:
-        socket.create_connection((host, int(port)), timeout=REACH_S).close()
-    except (OSError, OverflowError) as error:
-        raise ConfigError(
-            f"--address: nothing answers at {address} ({error}); start a cluster there with "
-            "'ray start --head'"
-        ) from error
-
-
-def _needs(
-    has: dict[str, float], fleet: Fleet, config: BackboneConfig
-) -> tuple[dict[str, float], int]:
-    """Return what Ray is asked for each worker, and how many there are to be."""
-    cores, gpus = int(has.get("CPU", 1)), int(has.get("GPU", 0))
-    if gpus and not is_on_cpu(config):
-        needs = {"num_gpus": 1, "num_cpus": fleet.cores or max(1, cores // gpus)}
-        num = fleet.num_workers or gpus
-    else:
-        needs = {"num_gpus": 0, "num_cpus": min(fleet.cores or CORES, cores)}
-        num = fleet.num_workers or max(1, cores // int(needs["num_cpus"]))
-    if num * needs["num_cpus"] > cores or num * needs["num_gpus"] > gpus:
-        raise ConfigError(
-            f"{num} workers of {needs['num_cpus']} cores and {needs['num_gpus']} GPUs; there are "
-            f"{cores} cores and {gpus} GPUs: lower --workers or --cores"
-        )
-    return {**needs, "max_restarts": 0}, num
-
-
 def _cause(error: Exception) -> Exception:
     """Return what went wrong in a worker: our own errors as they are."""
     cause = getattr(error, "cause", None)
     if isinstance(cause, LaserSlamError):
         return cause
-    return LaserSlamError(f"a worker failed: {_line(error)}; see Ray's log")
-
-
-def _line(error: Exception) -> str:
-    lines = [line for line in str(error).splitlines() if line.strip()]
-    return lines[-1].strip()[:200] if lines else type(error).__name__
+    return LaserSlamError(f"a worker failed: {last_line(error)}; see Ray's log")

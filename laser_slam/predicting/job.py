@@ -14,7 +14,8 @@ from laser_slam.datasets.base import Dataset
 from laser_slam.errors import ConfigError
 from laser_slam.export import write_tum
 from laser_slam.predicting.backbone_source import BackboneSource
-from laser_slam.predicting.fleet import STRETCH, Crew, Fleet, spread
+from laser_slam.predicting.cluster import Fleet
+from laser_slam.predicting.fleet import STRETCH, Crew, spread
 from laser_slam.predicting.settling import settle
 from laser_slam.store import link_latest, new_run_folder
 

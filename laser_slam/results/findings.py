@@ -35,6 +35,7 @@ class Findings:
         loops: what became of the loops; None: they were not looked for.
         truth: poses in metres; None: there is none.
         tiles: the whole map on disk; None: ``cloud`` is the whole.
+        raw: what the map would be without filters, thinned; None: it is not drawn.
     """
 
     trajectory: Trajectory
@@ -43,6 +44,12 @@ class Findings:
     loops: Loops | None
     truth: Trajectory | None
     tiles: TileFiles | None = None
+    raw: Cloud | None = None
+
+    @property
+    def num_points(self) -> int:
+        """Return how many points the whole map has."""
+        return len(self.cloud.points) if self.tiles is None else self.tiles.num_points
 
 
 def write_findings(folder: Path, found: Findings, slam: Slam) -> None:
@@ -74,6 +81,8 @@ def draw_findings(
     """
     draw_trajectory(pictures, found.trajectory, found.truth, found.scores.trajectory)
     draw_map(pictures, found.trajectory, found.cloud)
+    if found.raw is not None and len(found.raw.points):
+        draw_map(pictures, found.trajectory, found.raw, ending="_unfiltered")
     draw_depth(pictures, found.scores.views)
     draw_layers(pictures, found.scores.views, nodes)
     if found.loops is not None:

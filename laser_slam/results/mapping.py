@@ -25,6 +25,7 @@ def fuse_run(
     config: Config,
     load: Callable[[int], StoredWindow],
     watch: Watch | None = None,
+    see: Callable[[Submap], None] | None = None,
 ) -> TileFiles:
     """Make a run's map in ``folder/tiles``, or mend the one that is there.
 
@@ -37,6 +38,7 @@ def fuse_run(
         config: of the run.
         load: reads a window back, its layers applied.
         watch: is told how many windows are done, and of how many.
+        see: is shown each window that is read, some of them more than once.
 
     Returns:
         The map; ``num_points`` is 0 where nothing was seen with confidence.
@@ -50,10 +52,15 @@ def fuse_run(
         Part(index, _fingerprint(keyframes, index, files.stamp(index) + layers))
         for index in np.unique(keyframes.windows).tolist()
     ]
+
+    def placed(index: int) -> Submap:
+        submap = place_window(keyframes, index, load(index))
+        if see is not None:
+            see(submap)
+        return submap
+
     tiles = TileFiles(folder / TILES)
-    TiledMap(tiles, config.fusion).update(
-        parts, lambda index: place_window(keyframes, index, load(index)), watch
-    )
+    TiledMap(tiles, config.fusion).update(parts, placed, watch)
     return tiles
 
 

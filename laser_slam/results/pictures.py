@@ -60,14 +60,20 @@ def draw_trajectory(
     drift_picture(pictures / "drift.png", errors.distances_m, errors.drift_m)
 
 
-def draw_map(pictures: Path, trajectory: Trajectory, cloud: Cloud) -> None:
+def draw_map(pictures: Path, trajectory: Trajectory, cloud: Cloud, *, ending: str = "") -> None:
     """Draw the cloud from all sides that a person would look from.
+
+    Args:
+        pictures: folder of the files to be.
+        trajectory: a pose for every frame.
+        cloud: the map, in world units.
+        ending: of the files' names.
 
     Raises:
         RunFolderError: a picture cannot be written.
     """
     for view in CloudView:
-        cloud_picture(pictures / f"map_{view.value}.png", cloud, trajectory, view)
+        cloud_picture(pictures / f"map_{view.value}{ending}.png", cloud, trajectory, view)
 
 
 def draw_depth(pictures: Path, views: Sequence[KeyframeView]) -> None:
