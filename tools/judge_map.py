@@ -111,7 +111,7 @@ def judge(cloud: Cloud, truth: Truth) -> dict[str, float]:
         "completeness_cm": 100 * missing.mean(),
         "recall_%": 100 * recall,
         "chamfer_cm": 50 * (off.mean() + missing.mean()),
-        "f_%": 200 * precision * recall / (precision + recall),
+        "f_%": 200 * precision * recall / max(precision + recall, 1e-9),
     }
     if cloud.normals is not None:
         is_near = off < NEAR_M

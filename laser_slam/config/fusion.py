@@ -39,7 +39,7 @@ class FusionConfig(Section):
         8, ge=3, le=12, description="the map is made in cubes of 2^tile_bits voxels"
     )
     active_voxels: int = Field(
-        3_000_000,
+        1_000_000,
         ge=1,
         description="voxels in memory beyond which cubes go to disk (90 bytes each)",
     )

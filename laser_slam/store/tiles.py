@@ -151,23 +151,23 @@ class TileFiles:
         Raises:
             RunFolderError: no finished map is there, or a file is damaged.
         """
-        step = max(1, -(-self.num_points // most))
-        parts = list(self.clouds(step))
-        if not parts:
-            return Cloud(
-                np.empty((0, 3)),
-                np.empty((0, 3), np.uint8),
-                np.empty(0, np.float32),
-                self.voxel_size,
-                np.empty((0, 3), np.float32),
-            )
-        return Cloud(
-            np.concatenate([part.points for part in parts]),
-            np.concatenate([part.colors for part in parts]),
-            np.concatenate([part.weights for part in parts]),
-            parts[0].voxel_size,
-            np.concatenate([part.normals for part in parts if part.normals is not None]),
+        index = self.index()
+        step = max(1, -(-sum(entry.num_points for entry in index.tiles) // most))
+        num = sum(-(-entry.num_points // step) for entry in index.tiles)
+        whole = Cloud(  # filled part by part: joining them would take twice the memory
+            np.zeros((num, 3)),
+            np.empty((num, 3), np.uint8),
+            np.empty(num, np.float32),
+            index.voxel_size,
+            np.empty((num, 3), np.float32),
         )
+        start = 0
+        for part in self.clouds(step):
+            rows = slice(start, start + len(part.points))
+            for name in ("points", "colors", "weights", "normals"):
+                getattr(whole, name)[rows] = getattr(part, name)
+            start = rows.stop
+        return whole
 
     def index(self) -> TileIndex:
         """Read the index.
