@@ -46,6 +46,13 @@ def job(folder: Path, config: Config = CONFIG, fleet: Fleet | None = TWO, **more
     return Job(SyntheticDrive(config.synthetic), config, folder, fleet=fleet, **more)
 
 
+def begin(folder: Path) -> None:
+    """Leave the folder of a job of a fleet that had nothing done yet."""
+    source = job(folder).source
+    source.leave_to_others({**source.backbone.identity(), "stretch": 2})
+    source.open()
+
+
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """Predict stretch by stretch in this process: what any fleet must leave."""
@@ -109,8 +116,7 @@ def test_a_job_that_was_broken_off_goes_on_with_what_is_missing(
     tmp_path: Path, alone: dict[str, bytes]
 ) -> None:
     folder = tmp_path / "run"
-    work = job(folder)
-    work.source.open()
+    begin(folder)
     kept = {"000000.npz": b"kept", "000001.npz": b"kept", "000002.npz": b"half a stretch"}
     for name, content in kept.items():
         (folder / "windows" / name).write_bytes(content)
@@ -120,7 +126,7 @@ def test_a_job_that_was_broken_off_goes_on_with_what_is_missing(
 
 
 def test_what_a_fleet_began_is_not_gone_on_with_alone(tmp_path: Path) -> None:
-    job(tmp_path / "run").source.open()
+    begin(tmp_path / "run")
     with pytest.raises(LaserSlamError, match=r"identity.stretch \(2, now None\)"):
         job(tmp_path / "run", fleet=None).run()
 
@@ -129,14 +135,34 @@ def test_what_a_fleet_began_is_not_gone_on_with_alone(tmp_path: Path) -> None:
 def test_an_error_of_a_worker_comes_as_it_is(tmp_path: Path) -> None:
     missing = ["backbone.name=pi3", f"backbone.pi3.weights={tmp_path / 'gone.pt'}"]
     config = load_config(assignments=missing).backbone
-    with pytest.raises(WeightsError, match="no file"), Crew(ONE, config, {}):
+    with pytest.raises(WeightsError, match="no file"), Crew(ONE, config):
         pass
 
 
 @pytest.mark.usefixtures("cluster")
 def test_a_worker_with_another_backbone_is_refused() -> None:
-    with pytest.raises(ConfigError, match="give all machines the same weights and settings"):
-        Crew(ONE, CONFIG.backbone, {"another": 1}).__enter__()
+    crew = Crew(ONE, CONFIG.backbone)
+    crew.identity = {**CONFIG.backbone.classical.model_dump(), "num_planes": 7}
+    with pytest.raises(ConfigError, match=r"num_planes \(7, now 64\); give all machines the same"):
+        crew.__enter__()
+
+
+def test_the_size_of_windows_is_not_left_to_the_machine_that_does_not_predict(
+    tmp_path: Path,
+) -> None:
+    config = load_config(assignments=[*SMALL, "windows.size=auto"])
+    with pytest.raises(ConfigError, match="give the workers a number"):
+        job(tmp_path / "run", config)
+
+
+def test_a_machine_without_the_workers_device_can_lead_them(tmp_path: Path) -> None:
+    weights = tmp_path / "pi3.safetensors"
+    weights.write_bytes(b"read when the first window is predicted")
+    names = [f"backbone.pi3.weights={weights}", "backbone.pi3.device=cuda:7"]
+    config = load_config(assignments=[*SMALL, "backbone.name=pi3", *names])
+    lead = job(tmp_path / "run", config).source
+    assert lead.backbone is not None
+    assert lead.backbone.image_size((376, 1241)) == (154, 518)
 
 
 def test_the_simulated_backbone_is_not_spread(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from laser_slam.backbones.base import Backbone
 from laser_slam.bookkeeping import FrameLog, Progress, StageClock, identify
@@ -93,9 +94,12 @@ class BackboneSource:
         else:
             self._manifest.save(self._folder)
 
-    def start_afresh_after(self, num_windows: int) -> None:
-        """Note that the backbone forgets after so many windows, which makes other predictions."""
-        identity = {**self._manifest.identity, "stretch": num_windows}
+    def leave_to_others(self, identity: dict[str, Any]) -> None:
+        """Note that others predict, whose backbone may differ from this machine's.
+
+        Args:
+            identity: what their predictions depend on beside the images.
+        """
         self._manifest = replace(self._manifest, identity=identity)
 
     @property

@@ -22,7 +22,7 @@ from laser_slam.errors import ConfigError, LaserSlamError
 from laser_slam.predicting.backbone_source import BackboneSource
 from laser_slam.predicting.cluster import Fleet, connect, divide, last_line
 from laser_slam.rectification import reduce_images
-from laser_slam.store import pack_window
+from laser_slam.store import name_differences, pack_window
 from laser_slam.types import Window
 
 # Windows in a row that go to one worker, where the backbone remembers: it starts afresh with each
@@ -79,15 +79,15 @@ class Crew:
 
     Attributes:
         workers: handles of the processes.
+        identity: what predictions of all of them depend on beside the images; empty: not yet known.
     """
 
-    def __init__(self, fleet: Fleet, config: BackboneConfig, identity: dict[str, Any]) -> None:
+    def __init__(self, fleet: Fleet, config: BackboneConfig) -> None:
         """Start the workers, in Ray if it runs in this process already.
 
         Args:
             fleet: which.
             config: of the backbone.
-            identity: that the backbone must have everywhere.
 
         Raises:
             DependencyError: Ray is not installed.
@@ -95,7 +95,7 @@ class Crew:
         """
         self._ray = import_ray()
         self._config = config
-        self._identity = identity
+        self.identity: dict[str, Any] = {}
         self._is_guest = self._ray.is_initialized()
         self._tasks: dict[Any, tuple[Any, _Task]] = {}  # what comes of it -> worker, task
         self.workers: list[Any] = []
@@ -151,10 +151,12 @@ class Crew:
             found = self._ray.get(worker.identity.remote(), timeout=START_S)
         except self._ray.exceptions.RayError as error:
             raise _cause(error) from error
-        if found != self._identity:
+        self.identity = self.identity or found
+        if found != self.identity:
             raise ConfigError(
-                f"a worker has another backbone ({found}) than this machine ({self._identity}); "
-                "give all machines the same weights and settings"
+                f"a worker has another backbone than the others: "
+                f"{name_differences(self.identity, found)}; give all machines the same weights "
+                "and the same kind of device, or set dtype"
             )
 
     def _give(self, task: _Task, intrinsics: NDArray[np.float64] | None) -> None:
@@ -187,7 +189,7 @@ class Crew:
         if task.num_tries == MAX_TRIES:
             raise LaserSlamError(
                 f"{MAX_TRIES} workers were lost over windows {first} to {last} "
-                f"({last_line(error)}); see Ray's log; give each worker more memory, or lower windows.size"
+                f"({last_line(error)}); see Ray's log; give each more memory, or lower windows.size"
             ) from error
         logger.warning("a worker was lost; windows %d to %d are done again", first, last)
         if lost in self.workers:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from laser_slam.backbones import FROM_TRUTH, REPLAY, make_backbone
 from laser_slam.backbones.base import Backbone
 from laser_slam.bookkeeping import Progress, StageClock, no_progress, run_log
-from laser_slam.config import Config
+from laser_slam.config import BackboneConfig, Config, NetworkConfig
 from laser_slam.datasets.base import Dataset
 from laser_slam.errors import ConfigError
 from laser_slam.export import write_tum
@@ -54,11 +55,8 @@ class Job:
         """
         if backbone is None and config.backbone.name == REPLAY:
             raise ConfigError("backbone.name: 'replay' predicts nothing; name a backbone")
-        if fleet is not None and config.backbone.name in FROM_TRUTH:
-            raise ConfigError(
-                f"--engine: '{config.backbone.name}' knows the truth of the data set, which "
-                "workers do not have; predict without --engine"
-            )
+        if fleet is not None:
+            _refuse_what_cannot_spread(config)
         self._dataset = dataset
         self._fleet = fleet
         self._is_named_here = out is None
@@ -66,12 +64,12 @@ class Job:
         info = dataset.info
         config = settle(config, info, out)
         self.folder = Path(os.path.normpath(out)) if out else new_run_folder(info.name)
-        backbone = backbone or make_backbone(config.backbone, info, dataset.true_depth)
+        # Of a fleet, this machine does all but predict: it may have no GPU.
+        here = config.backbone if fleet is None else _on_cpu(config.backbone)
+        backbone = backbone or make_backbone(here, info, dataset.true_depth)
         self._backbone = config.backbone
         clock = StageClock()
         self.source = BackboneSource(dataset, config, self.folder, backbone, clock, on_progress)
-        if fleet is not None and backbone.remembers:
-            self.source.start_afresh_after(STRETCH)
 
     def run(self) -> int:
         """Predict and store; return how many windows there are.
@@ -79,27 +77,56 @@ class Job:
         Raises:
             LaserSlamError: the input, the settings or the folder cannot be used.
         """
-        info = self._dataset.info
-        self.source.open()
-        with run_log(self.folder / "run.log"):
-            self.source.calibrate()
-            num = 0
-            for frame in self._predict():
-                num += 1
-                self._on_progress("predicting", frame + 1, info.num_frames)
+        info, num = self._dataset.info, 0
+        with self._crew() as crew:
+            self.source.open()
+            with run_log(self.folder / "run.log"):
+                self.source.calibrate()
+                for frame in self._predict(crew):
+                    num += 1
+                    self._on_progress("predicting", frame + 1, info.num_frames)
         if info.truth is not None:
             write_tum(self.folder / "truth_tum.txt", info.truth)
         if self._is_named_here:
             link_latest(self.folder)
         return num
 
-    def _predict(self) -> Iterator[int]:
-        """Predict here, or let the fleet do it; give the last frame of each window that is done."""
-        if self._fleet is None or self.source.is_complete:
+    @contextmanager
+    def _crew(self) -> Iterator[Crew | None]:
+        """Have the workers ready; what they predict with is what the predictions are made by."""
+        if self._fleet is None:
+            yield None
+            return
+        with Crew(self._fleet, self._backbone) as crew:
+            stretch = {"stretch": STRETCH} if self.source.remembers else {}
+            self.source.leave_to_others({**crew.identity, **stretch})
+            yield crew
+
+    def _predict(self, crew: Crew | None) -> Iterator[int]:
+        """Predict here, or let the crew do it; give the last frame of each window that is done."""
+        if crew is None or self.source.is_complete:
             for prediction, _ in self.source.windows():
                 yield int(prediction.frames[-1])
             return
-        with Crew(self._fleet, self._backbone, self.source.backbone.identity()) as crew:
-            self._on_progress("predicting", 0, self._dataset.info.num_frames)  # all are ready
-            for stretch in spread(self.source, crew):
-                yield from (int(window.frames[-1]) for window in stretch)
+        self._on_progress("predicting", 0, self._dataset.info.num_frames)  # all are ready
+        for stretch in spread(self.source, crew):
+            yield from (int(window.frames[-1]) for window in stretch)
+
+
+def _refuse_what_cannot_spread(config: Config) -> None:
+    if config.backbone.name in FROM_TRUTH:
+        raise ConfigError(
+            f"--engine: '{config.backbone.name}' knows the truth of the data set, which "
+            "workers do not have; predict without --engine"
+        )
+    if not config.windows.size:
+        raise ConfigError("windows.size: auto looks at this machine; give the workers a number")
+
+
+def _on_cpu(config: BackboneConfig) -> BackboneConfig:
+    """Return the settings of a network for a machine that does not run it; else as they are."""
+    section = getattr(config, config.name, None)
+    if not isinstance(section, NetworkConfig):
+        return config
+    here = section.model_copy(update={"device": "cpu", "dtype": "auto"})
+    return config.model_copy(update={config.name: here})
