@@ -53,7 +53,6 @@ from laser_slam.store.keyframes import save_originals
 from laser_slam.types import Image, Prediction, Trajectory
 from laser_slam.viewer import NullViewer, Viewer
 
-IN_MEMORY = 15_000_000  # points of the map that a Python user gets; of a larger one an even part
 logger = logging.getLogger(__name__)
 
 
@@ -210,7 +209,7 @@ class Pipeline:
         if self._closer is not None:
             loops = look_back(self._closer, self._slam, self._trajectory(closed=False), truth)
         unfiltered = raw.cloud(tiles.voxel_size)
-        cloud = tiles.cloud(IN_MEMORY)
+        cloud = tiles.cloud(config.fusion.cloud_points)
         return Findings(trajectory, cloud, scores, loops, truth, tiles, unfiltered)
 
     def _true_depth(self, frame: int) -> NDArray[np.float32] | None:
