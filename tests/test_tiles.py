@@ -1,6 +1,7 @@
 """Tiles change nothing but memory; a map is mended where something changed, and only there."""
 
 import json
+import resource
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -240,3 +241,23 @@ def test_a_folder_that_cannot_be_written_is_said_in_a_line(tmp_path: Path) -> No
     (tmp_path / "file").write_text("")
     with pytest.raises(RunFolderError, match=r"cannot keep map tiles in .*choose another folder"):
         update(tmp_path / "file", street(1))
+
+
+@pytest.mark.parametrize("active_voxels", [1000, 10**6])
+def test_a_full_disk_is_said_in_a_line_and_leaves_no_half_map(
+    tmp_path: Path, active_voxels: int
+) -> None:
+    """It fills up while the drive goes on, or at its end."""
+    config = CONFIG.model_copy(update={"tile_bits": 12, "active_voxels": active_voxels})
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(RunFolderError, match=r"cannot write .*; .*choose another folder"):
+            update(tmp_path, street(3), config)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with pytest.raises(RunFolderError, match="no finished map"):
+        TileFiles(tmp_path).index()
+    update(tmp_path, street(3), config)
+    assert TileFiles(tmp_path).num_points > 500
+    assert not list(tmp_path.rglob("*.partial*"))
