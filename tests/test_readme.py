@@ -37,16 +37,16 @@ def test_the_python_example_runs(
 
 
 def test_every_command_of_the_readme_exists() -> None:
-    commands = set(re.findall(r"laser-slam (demo|[a-z]+) ?", " ".join(code_blocks())))
-    assert {"images", "video", "kitti", "eval"} <= commands
+    commands = set(re.findall(r"laser-slam ((?:predict )?[a-z]+) ?", " ".join(code_blocks())))
+    assert {"images", "video", "kitti", "eval", "predict kitti", "export"} <= commands
     for command in commands:
-        assert CliRunner().invoke(app, [command, "--help"]).exit_code == 0, command
+        assert CliRunner().invoke(app, [*command.split(), "--help"]).exit_code == 0, command
 
 
 def test_every_option_of_the_readme_exists() -> None:
     helps = [
-        CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"}).output
-        for command in ("images", "kitti", "eval")
+        CliRunner().invoke(app, [*command.split(), "--help"], env={"COLUMNS": "200"}).output
+        for command in ("images", "kitti", "eval", "export", "view", "replay", "predict kitti")
     ]
     for option in set(re.findall(r"--[a-z-]+", " ".join(code_blocks()))):
         assert any(option in text for text in helps), option
