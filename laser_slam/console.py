@@ -69,7 +69,7 @@ def print_summary(report: dict[str, Any], folder: Path) -> None:
         table.add_row(name, Text(value))
     points = f"{report['map']['num_points']:,} points"
     table.add_row("map", Text(f"{folder / 'map.ply'}, {points}"))
-    table.add_row("pictures", Text(str(folder / "pictures")))
+    table.add_row("report", Text(str(folder / "report.html")))
     Console(soft_wrap=True).print(table)
 
 

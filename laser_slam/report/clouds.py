@@ -41,7 +41,13 @@ _SKIES = {  # top and bottom of the background
 
 
 def cloud_picture(
-    path: Path, cloud: Cloud, trajectory: Trajectory, view: CloudView, *, unit: str = "world units"
+    path: Path,
+    cloud: Cloud,
+    trajectory: Trajectory,
+    view: CloudView,
+    *,
+    unit: str = "world units",
+    like: Cloud | None = None,
 ) -> None:
     """Draw the cloud in one of the views, with the trajectory over it unless from the seat.
 
@@ -51,11 +57,12 @@ def cloud_picture(
         trajectory: of the camera, at least one pose; tells what is down and forward.
         view: above (parallel, the whole map), bird (oblique) or driver (along the road).
         unit: of the world, for the scale bar.
+        like: another cloud, to be seen from where that one is; None: from where it suits this one.
 
     Raises:
         RunFolderError: the picture cannot be written.
     """
-    viewpoint = _PLACES[view](cloud, trajectory)
+    viewpoint = _PLACES[view](cloud if like is None else like, trajectory)
     image = _render_smooth(_with_size(cloud), viewpoint, view)
     height, width = viewpoint.size
     with picture(path, height, layout=None) as figure:

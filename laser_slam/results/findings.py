@@ -80,9 +80,8 @@ def draw_findings(
         RunFolderError: a picture cannot be written.
     """
     draw_trajectory(pictures, found.trajectory, found.truth, found.scores.trajectory)
-    draw_map(pictures, found.trajectory, found.cloud)
-    if found.raw is not None and len(found.raw.points):
-        draw_map(pictures, found.trajectory, found.raw, ending="_unfiltered")
+    raw = found.raw if found.raw is not None and len(found.raw.points) else None
+    draw_map(pictures, found.trajectory, found.cloud, raw)
     draw_depth(pictures, found.scores.views)
     draw_layers(pictures, found.scores.views, nodes)
     if found.loops is not None:

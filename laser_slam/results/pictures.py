@@ -60,20 +60,26 @@ def draw_trajectory(
     drift_picture(pictures / "drift.png", errors.distances_m, errors.drift_m)
 
 
-def draw_map(pictures: Path, trajectory: Trajectory, cloud: Cloud, *, ending: str = "") -> None:
+def draw_map(
+    pictures: Path, trajectory: Trajectory, cloud: Cloud, unfiltered: Cloud | None = None
+) -> None:
     """Draw the cloud from all sides that a person would look from.
 
     Args:
         pictures: folder of the files to be.
         trajectory: a pose for every frame.
         cloud: the map, in world units.
-        ending: of the files' names.
+        unfiltered: what it would be without filters, drawn from the same places; None: it is not.
 
     Raises:
         RunFolderError: a picture cannot be written.
     """
     for view in CloudView:
-        cloud_picture(pictures / f"map_{view.value}{ending}.png", cloud, trajectory, view)
+        path = pictures / f"map_{view.value}.png"
+        cloud_picture(path, cloud, trajectory, view)
+        if unfiltered is not None:
+            path = pictures / f"map_{view.value}_unfiltered.png"
+            cloud_picture(path, unfiltered, trajectory, view, like=cloud)
 
 
 def draw_depth(pictures: Path, views: Sequence[KeyframeView]) -> None:
