@@ -1,6 +1,27 @@
 """Metrics: numbers in, numbers out; no files, no plots."""
 
 from laser_slam.evaluation.depth import DepthErrors, evaluate_depth
+from laser_slam.evaluation.means import (
+    KITTI_ODOMETRY,
+    Mean,
+    SequenceScores,
+    failed_sequence,
+    kitti_means,
+    kitti_scores,
+    mean_score,
+    point_scores,
+    pose_scores,
+    video_depth_scores,
+)
+from laser_slam.evaluation.points import (
+    INDOOR_POINTS,
+    KEYFRAME_INTERVAL,
+    OUTDOOR_POINTS,
+    PointErrors,
+    PointMap,
+    PointProtocol,
+    evaluate_points,
+)
 from laser_slam.evaluation.trajectory import (
     KittiErrors,
     Statistics,
@@ -11,16 +32,45 @@ from laser_slam.evaluation.trajectory import (
     kitti_errors,
     relative_errors,
 )
+from laser_slam.evaluation.video_depth import (
+    VIDEO_DEPTH_PROTOCOLS,
+    VideoDepthErrors,
+    VideoDepthProtocol,
+    evaluate_video_depth,
+    resize_depth,
+)
 
 __all__ = [
+    "INDOOR_POINTS",
+    "KEYFRAME_INTERVAL",
+    "KITTI_ODOMETRY",
+    "OUTDOOR_POINTS",
+    "VIDEO_DEPTH_PROTOCOLS",
     "DepthErrors",
     "KittiErrors",
+    "Mean",
+    "PointErrors",
+    "PointMap",
+    "PointProtocol",
+    "SequenceScores",
     "Statistics",
     "TrajectoryErrors",
+    "VideoDepthErrors",
+    "VideoDepthProtocol",
     "absolute_errors",
     "align",
     "evaluate_depth",
+    "evaluate_points",
     "evaluate_trajectory",
+    "evaluate_video_depth",
+    "failed_sequence",
     "kitti_errors",
+    "kitti_means",
+    "kitti_scores",
+    "mean_score",
+    "point_scores",
+    "pose_scores",
     "relative_errors",
+    "resize_depth",
+    "video_depth_scores",
 ]

@@ -71,6 +71,7 @@ class TrajectoryErrors:
         frames: (N,) indices of the frames that estimate and truth have in common.
         distances_m: (N,) path of the truth up to each of them.
         num_frames: how many these are.
+        num_truth: frames whose true pose is known, whether they were estimated or not.
         path_length_m: of the truth over these frames.
         scale: metres per world unit of the Sim(3) alignment.
         ate_sim3_m: absolute errors after the best similarity.
@@ -99,6 +100,7 @@ class TrajectoryErrors:
     errors_m: Array = field(default_factory=_no_errors)
     drift_m: Array = field(default_factory=_no_errors)
     reason: str | None = None
+    num_truth: int = 0
 
     def numbers(self) -> dict[str, object]:
         """Return the scores without the series, ready for JSON."""
@@ -113,10 +115,11 @@ def evaluate_trajectory(estimate: Trajectory, truth: Trajectory) -> TrajectoryEr
         estimate: in world units, of any scale.
         truth: in metres, of all frames or some.
     """
+    num_truth = len(truth.frames)
     estimate, truth = common_frames(estimate, truth)
-    distances = path_distances(truth)
+    distances, num = path_distances(truth), len(truth.frames)
     unscored = TrajectoryErrors(
-        truth.frames, distances, len(truth.frames), float(distances.max(initial=0))
+        truth.frames, distances, num, float(distances.max(initial=0)), num_truth=num_truth
     )
     try:
         sim3 = align(estimate, truth, with_scale=True)

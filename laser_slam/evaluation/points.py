@@ -1,0 +1,211 @@
+"""Errors of point maps against true ones: accuracy, completeness, normals.
+
+Reference: Spann3R (arXiv:2408.16061) and CUT3R (arXiv:2501.12387), whose evaluation the LASER
+paper follows; the outdoor variant is VGGT-Long's (arXiv:2507.16443). Differs: a true point whose
+pixel has no prediction still counts for completeness; networks predict every pixel, so that their
+scores are the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from laser_slam.dependencies import import_open3d
+from laser_slam.errors import DegenerateGeometryError
+from laser_slam.sim3 import Sim3, umeyama
+
+Array = NDArray[np.float64]
+
+KEYFRAME_INTERVAL = 10  # every so many-th frame of 7-Scenes and NRGBD is predicted and compared
+
+
+@dataclass(frozen=True)
+class PointProtocol:
+    """What of the point maps is compared, and how they are brought together.
+
+    Attributes:
+        icp_threshold_m: farthest partner of a point in the iterative closest point refinement.
+        crop_px: side of the central square that is compared, in pixels of the maps; None: all.
+        dropped_share: share of the pixels, those of least confidence, that is left out, in [0, 1).
+        has_normals: False leaves the normals out.
+    """
+
+    icp_threshold_m: float = 0.1
+    crop_px: int | None = None
+    dropped_share: float = 0.0
+    has_normals: bool = True
+
+
+INDOOR_POINTS = PointProtocol(crop_px=224)  # 7-Scenes and NRGBD, of maps 518 pixels wide
+OUTDOOR_POINTS = PointProtocol(dropped_share=0.4, has_normals=False)  # Waymo
+
+
+@dataclass(frozen=True)
+class PointMap:
+    """The points of one frame's pixels, predicted and true.
+
+    Attributes:
+        points: (H, W, 3) in world units; NaN: unknown.
+        truth: (H, W, 3) in metres, in the truth's own frame; NaN: unknown.
+        confidence: (H, W) in [0, 1]; None: there is none.
+
+    Raises:
+        ValueError: shapes disagree.
+    """
+
+    points: Array
+    truth: Array
+    confidence: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        """Check shapes once, here."""
+        if self.points.shape != self.truth.shape or self.truth.shape[2:] != (3,):
+            raise ValueError(f"points {self.points.shape}, truth {self.truth.shape}")
+        if self.confidence is not None and self.confidence.shape != self.truth.shape[:2]:
+            raise ValueError(f"confidence {self.confidence.shape}, truth {self.truth.shape}")
+
+
+@dataclass(frozen=True)
+class PointErrors:
+    """How far predicted points are from the true surface and back; None: nothing to compare.
+
+    Attributes:
+        acc_mean_m: mean distance of a predicted point from the nearest true one.
+        acc_median_m: their median.
+        comp_mean_m: mean distance of a true point from the nearest predicted one.
+        comp_median_m: their median.
+        nc_mean: mean |cosine| between the normals of nearest points, averaged over both ways.
+        nc_median: the medians, averaged over both ways.
+        chamfer_m: mean of ``acc_mean_m`` and ``comp_mean_m``.
+        scale: metres per world unit of the Sim(3) alignment.
+        icp_fitness: share of the predicted points with a partner within the threshold at its end.
+        num_points: predicted points that are compared.
+        num_truth: true points that are compared.
+        reason: why nothing is scored; None: it is.
+    """
+
+    acc_mean_m: float | None = None
+    acc_median_m: float | None = None
+    comp_mean_m: float | None = None
+    comp_median_m: float | None = None
+    nc_mean: float | None = None
+    nc_median: float | None = None
+    chamfer_m: float | None = None
+    scale: float | None = None
+    icp_fitness: float | None = None
+    num_points: int = 0
+    num_truth: int = 0
+    reason: str | None = None
+
+
+def evaluate_points(maps: Iterable[PointMap], protocol: PointProtocol) -> PointErrors:
+    """Compare point maps with the truth after Sim(3) alignment and ICP.
+
+    Pixels correspond for the alignment (Umeyama), nearest points for the rest. Frames are read one
+    at a time; only what is compared is kept: 48 bytes a pixel.
+
+    Args:
+        maps: one for each keyframe, all in one frame of coordinates.
+        protocol: what is compared.
+
+    Raises:
+        ValueError: the protocol drops by confidence, and a map has none.
+    """
+    found, true = _compared_points(maps, protocol)
+    known = np.isfinite(found).all(axis=1)
+    num_points, num_truth = int(known.sum()), len(true)
+    try:
+        metric_from_world = umeyama(found[known], true[known])
+    except DegenerateGeometryError as error:
+        return PointErrors(num_points=num_points, num_truth=num_truth, reason=str(error))
+    cloud, target = _cloud(metric_from_world.apply(found[known])), _cloud(true)
+    fitness = _refine(cloud, target, protocol.icp_threshold_m)
+    return _scores(cloud, target, protocol, metric_from_world, fitness)
+
+
+def _compared_points(maps: Iterable[PointMap], protocol: PointProtocol) -> tuple[Array, Array]:
+    """Return (N, 3) predictions, NaN where unknown, and their true points, which are known."""
+    parts = [_known_truth(each, protocol) for each in maps]
+    found = np.concatenate([np.empty((0, 3)), *(part[0] for part in parts)])
+    true = np.concatenate([np.empty((0, 3)), *(part[1] for part in parts)])
+    if not protocol.dropped_share or not len(true):
+        return found, true
+    confidence = np.concatenate([part[2] for part in parts])
+    cutoff = np.percentile(confidence, 100 * protocol.dropped_share)
+    return found[confidence >= cutoff], true[confidence >= cutoff]
+
+
+def _known_truth(each: PointMap, protocol: PointProtocol) -> tuple[Array, Array, Array]:
+    """Return the (M, 3) points, (M, 3) truth and (M,) confidence of the pixels with truth."""
+    if protocol.dropped_share and each.confidence is None:
+        raise ValueError("the least confident points are to be dropped, and there is no confidence")
+    rows, columns = (_central(size, protocol.crop_px) for size in each.truth.shape[:2])
+    points, truth = each.points[rows, columns], each.truth[rows, columns]
+    valid = np.isfinite(truth).all(axis=-1)
+    found = np.where(np.isfinite(points).all(axis=-1, keepdims=True), points, np.nan)[valid]
+    if each.confidence is None:
+        return found, truth[valid], np.empty(0)
+    confidence = each.confidence[rows, columns][valid].astype(np.float64)
+    confidence[np.isnan(found[:, 0])] = -1.0  # what is not predicted is dropped first
+    return found, truth[valid], confidence
+
+
+def _central(size: int, crop: int | None) -> slice:
+    if crop is None or crop >= size:
+        return slice(None)
+    first = size // 2 - crop // 2
+    return slice(first, first + crop)
+
+
+def _cloud(points: Array) -> Any:
+    open3d = import_open3d()
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(np.ascontiguousarray(points)))
+
+
+def _refine(cloud: Any, target: Any, threshold: float) -> float:
+    """Move ``cloud`` by point-to-point ICP from where it is; return the share of partners."""
+    registration = import_open3d().pipelines.registration
+    estimation = registration.TransformationEstimationPointToPoint()
+    result = registration.registration_icp(cloud, target, threshold, np.eye(4), estimation)
+    cloud.transform(result.transformation)
+    return float(result.fitness)
+
+
+def _scores(
+    cloud: Any, target: Any, protocol: PointProtocol, metric_from_world: Sim3, fitness: float
+) -> PointErrors:
+    points, truth = np.asarray(cloud.points), np.asarray(target.points)
+    acc, nearest_true = cKDTree(truth).query(points, workers=-1)
+    comp, nearest_point = cKDTree(points).query(truth, workers=-1)
+    nc_mean = nc_median = None
+    if protocol.has_normals:
+        normals, true_normals = _normals(cloud), _normals(target)
+        there = np.abs((true_normals[nearest_true] * normals).sum(axis=1))
+        back = np.abs((true_normals * normals[nearest_point]).sum(axis=1))
+        nc_mean = float(there.mean() + back.mean()) / 2
+        nc_median = float(np.median(there) + np.median(back)) / 2
+    return PointErrors(
+        acc_mean_m=float(acc.mean()),
+        acc_median_m=float(np.median(acc)),
+        comp_mean_m=float(comp.mean()),
+        comp_median_m=float(np.median(comp)),
+        nc_mean=nc_mean,
+        nc_median=nc_median,
+        chamfer_m=float(acc.mean() + comp.mean()) / 2,
+        scale=metric_from_world.scale,
+        icp_fitness=fitness,
+        num_points=len(points),
+        num_truth=len(truth),
+    )
+
+
+def _normals(cloud: Any) -> Array:
+    """Return (N, 3) unit normals from each point's 30 neighbours, Open3D's default."""
+    cloud.estimate_normals()
+    return np.asarray(cloud.normals)
