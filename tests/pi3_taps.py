@@ -77,7 +77,7 @@ def name_modules(network: Trunk) -> dict[str, nn.Module]:
         "camera_hidden": network.camera_decoder,
         "cam_t": camera.fc_t,
         "cam_rot9": camera.fc_rot,
-        "cam_res": camera.res_conv[-1],
+        "cam_feat": camera.more_mlps,
     }
     named |= {f"dec{i}": block for i, block in enumerate(network.decoder)}
     if isinstance(network, Pi3):
@@ -123,7 +123,6 @@ def _pick(key: str, seen: Seen, case: golden.Case, expected: golden.Array) -> Te
         "dec_out_c8": lambda: _both_halves(seen["dec_out"][0])[:, :: case.stride],
         "dec0_qkv_tok7": lambda: seen["dec0_qkv"][0][:, 6],
         "dec0_q_normed_head0": lambda: seen["dec0_q_normed"][0][:, 0],
-        "cam_feat": lambda: seen["cam_res"][0].mean(dim=1),
         "depth_enc_out": lambda: seen["depth_enc_out"][0][:, 5:, channels],
         "ray_emb": lambda: seen["ray_emb"][0][..., channels],
         "metric_hidden": lambda: seen["metric_hidden"][0][..., channels],
