@@ -127,6 +127,28 @@ def import_ray() -> Any:
     return ray
 
 
+@cache
+def import_kiss_icp() -> Any:
+    """Import KISS-ICP's odometry, which only the LiDAR reference needs.
+
+    Returns:
+        The package, with its modules ``kiss_icp`` and ``config``.
+
+    Raises:
+        DependencyError: it is missing, cannot be loaded or is too old; says how to get it.
+    """
+    try:
+        import kiss_icp  # noqa: PLC0415  (an extra)
+
+        import_module("kiss_icp.config")
+        _ = import_module("kiss_icp.kiss_icp").KissICP.register_frame
+    except (ImportError, OSError, AttributeError) as error:
+        raise DependencyError(
+            f"KISS-ICP cannot be loaded ({error}); install it: pip install 'laser-slam[lidar]'"
+        ) from error
+    return kiss_icp
+
+
 def num_threads() -> int:
     """Return how many threads are worth having: as OMP_NUM_THREADS says, or one for each core."""
     told = os.environ.get("OMP_NUM_THREADS", "")

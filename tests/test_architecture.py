@@ -17,9 +17,9 @@ STAGES = [
     "export",
     "evaluation",
 ]
-STAGES += ["viewer", "report", "layers", "places", "pose_graph"]
+STAGES += ["viewer", "report", "layers", "places", "pose_graph", "lidar_odometry"]
 COMPOSITION = ["closures", "slam", "bookkeeping", "results", "rescoring", "predicting", "pipeline"]
-COMPOSITION += ["exporting", "viewing", "console", "cli"]
+COMPOSITION += ["exporting", "viewing", "lidar_comparison", "lidar_reference", "console", "cli"]
 TORCH = {"torch", "safetensors"}  # no dependencies of a plain installation
 HEAVY = {"open3d", *TORCH, "gtsam", "numba", "cv2", "matplotlib", "scipy"}
 MODULES = sorted(PACKAGE.rglob("*.py"))
