@@ -118,8 +118,9 @@ class Pipeline:
         with run_log(self.folder / "run.log") as warnings, closing(self._viewer):
             with self._clock.stage("calibrate"):
                 self.source.calibrate()
-            for prediction, colors in self.source.windows():
-                self._place(prediction, colors)
+            with closing(self.source.windows()) as windows:
+                for prediction, colors in windows:
+                    self._place(prediction, colors)
             if self._closer is not None:
                 with self._clock.stage("places"):
                     self._closer.finish()

@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 class BackboneSource:
     """Windows that a backbone predicts while those before are used.
 
-    One thread reads, chooses keyframes and cuts windows, another predicts and stores: the backbone
+    One thread reads, chooses keyframes and cuts windows, one predicts, one stores: the backbone
     waits neither for the disk nor for the rest of the run.
 
     Attributes:
@@ -121,15 +121,15 @@ class BackboneSource:
         if self.calibration.warning:
             logger.warning("calibration: %s", self.calibration.warning)
 
-    def windows(self) -> Iterator[tuple[Prediction, Image]]:
+    def windows(self) -> Generator[tuple[Prediction, Image], None, None]:
         """Predict the windows, or read what was said of them before the run was broken off."""
         if self._stored is not None:
             self.input = FrameLog(*load_frames(self._folder))
             yield from load_windows(self.files, self._stored, self._clock)
             return
         frames = []
-        with closing(ahead(self._predicted(), self._clock.idle)) as predicted:
-            for prediction, colors in predicted:
+        with closing(ahead(self._stored_ones(), self._clock.idle)) as stored:
+            for prediction, colors in stored:
                 frames.append(prediction.frames.tolist())
                 yield prediction, colors
         self.finish(frames)
@@ -143,19 +143,27 @@ class BackboneSource:
         save_frames(self._folder, self.input.times_s, self.input.unreadable)
         self._manifest.with_windows(frames).save(self._folder)
 
-    def _predicted(self) -> Iterator[tuple[Prediction, Image]]:
+    def _stored_ones(self) -> Generator[tuple[Prediction, Image], None, None]:
+        with closing(ahead(self._predicted(), self._clock.idle)) as predicted:
+            for window, prediction in predicted:
+                yield self._store(window, prediction)
+
+    def _predicted(self) -> Generator[tuple[Window, Prediction | None], None, None]:
+        """Give windows with what the backbone says of them; None: there is a file of it."""
         with closing(ahead(self.cut(), self._clock.idle)) as windows:
             for window in windows:
-                yield self._predict(window)
+                is_there = not self.remembers and self.files.has(window.index)
+                yield window, None if is_there else self._predict(window)
 
-    def _predict(self, window: Window) -> tuple[Prediction, Image]:
-        if not self.remembers and self.files.has(window.index):
+    def _predict(self, window: Window) -> Prediction:
+        with self._clock.stage("predict"):
+            return self.backbone.predict(window.images, window.frames, self.rectifier.intrinsics)
+
+    def _store(self, window: Window, prediction: Prediction | None) -> tuple[Prediction, Image]:
+        """Write a window's file, or read the one that is there."""
+        if prediction is None:
             with self._clock.stage("load"):
                 return self.files.load(window.index, window.frames)
-        with self._clock.stage("predict"):
-            prediction = self.backbone.predict(
-                window.images, window.frames, self.rectifier.intrinsics
-            )
         with self._clock.stage("store"):
             colors = reduce_images(window.images, prediction.depth.shape[1:])
             return self.files.save(window.index, prediction, colors)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Generator, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from laser_slam.backbones import FROM_TRUTH, REPLAY, make_backbone
@@ -82,9 +82,10 @@ class Job:
             self.source.open()
             with run_log(self.folder / "run.log"):
                 self.source.calibrate()
-                for frame in self._predict(crew):
-                    num += 1
-                    self._on_progress("predicting", frame + 1, info.num_frames)
+                with closing(self._predict(crew)) as last_frames:
+                    for frame in last_frames:
+                        num += 1
+                        self._on_progress("predicting", frame + 1, info.num_frames)
         if info.truth is not None:
             write_tum(self.folder / "truth_tum.txt", info.truth)
         if self._is_named_here:
@@ -102,11 +103,12 @@ class Job:
             self.source.leave_to_others({**crew.identity, **stretch})
             yield crew
 
-    def _predict(self, crew: Crew | None) -> Iterator[int]:
+    def _predict(self, crew: Crew | None) -> Generator[int, None, None]:
         """Predict here, or let the crew do it; give the last frame of each window that is done."""
         if crew is None or self.source.is_complete:
-            for prediction, _ in self.source.windows():
-                yield int(prediction.frames[-1])
+            with closing(self.source.windows()) as windows:
+                for prediction, _ in windows:
+                    yield int(prediction.frames[-1])
             return
         self._on_progress("predicting", 0, self._dataset.info.num_frames)  # all are ready
         for stretch in spread(self.source, crew):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 from laser_slam.bookkeeping import FrameLog, StageClock, identify
@@ -81,7 +81,7 @@ class ReplaySource:
         self._manifest.save(self._folder)
         save_frames(self._folder, self.input.times_s, self.input.unreadable)
 
-    def windows(self) -> Iterator[tuple[Prediction, Image]]:
+    def windows(self) -> Generator[tuple[Prediction, Image], None, None]:
         """Read the windows, whose files become the run's own."""
         windows, origin = self._manifest.windows or [], WindowFiles(self._origin)
         for index in range(len(windows)):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from contextlib import closing
 from typing import Protocol
 
@@ -54,8 +54,11 @@ class Source(Protocol):
         """Learn how the camera projects."""
         ...
 
-    def windows(self) -> Iterator[tuple[Prediction, Image]]:
-        """Give each window with its (N, H, W, 3) RGB colours, which are in its file by then."""
+    def windows(self) -> Generator[tuple[Prediction, Image], None, None]:
+        """Give each window with its (N, H, W, 3) RGB colours, which are in its file by then.
+
+        Closing it ends what runs ahead.
+        """
         ...
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -61,6 +62,7 @@ class NetworkBackbone(ABC):
         self._config = config
         self._placement = choose_placement(config.device, config.dtype, f"backbone.{self.name}")
         self._given = network
+        self._one_at_a_time = threading.Lock()  # windows of loops come from another thread
         self._weights = None
         if network is None:
             self._weights = find_weights(config.weights, self._checkpoint())
@@ -130,14 +132,19 @@ class NetworkBackbone(ABC):
                 f"backbone.{self.name}.intrinsics: 'given', but this input has none; "
                 "give them, or use 'fitted'"
             )
-        pixels, network = np.stack(images), self._network
+        with self._one_at_a_time:
+            view = self._see(np.stack(images), intrinsics)
+        return to_prediction(view, frames)
+
+    def _see(self, pixels: NDArray[np.uint8], intrinsics: NDArray[np.float64] | None) -> View:
+        """Run the network on (N, H, W, 3) pixels."""
+        network = self._network
         free_bytes = self._placement.free_bytes()
         try:
             with self._placement.computing():
-                view = self._view(network, self._placement.upload(pixels), intrinsics)
+                return self._view(network, self._placement.upload(pixels), intrinsics)
         except RuntimeError as error:
-            view = self._after(error, pixels.shape, free_bytes)
-        return to_prediction(view, frames)
+            return self._after(error, pixels.shape, free_bytes)
 
     def _after(self, error: RuntimeError, shape: tuple[int, ...], free_bytes: int) -> View:
         """Say what to do where memory was too short for images of ``shape``.
