@@ -1,9 +1,25 @@
 """The command line: one module for each kind of command, heavy imports inside the commands."""
 
-from laser_slam.cli import export_command, sources, stored, view_command
+from laser_slam.cli import (
+    dataset_sources,
+    export_command,
+    lidar_command,
+    sources,
+    stored,
+    view_command,
+)
 from laser_slam.cli.app import app
 
-__all__ = ["app", "export_command", "main", "sources", "stored", "view_command"]
+__all__ = [
+    "app",
+    "dataset_sources",
+    "export_command",
+    "lidar_command",
+    "main",
+    "sources",
+    "stored",
+    "view_command",
+]
 
 
 def main() -> None:
