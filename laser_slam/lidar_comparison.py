@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -162,10 +162,11 @@ class _DepthComparison:
             for depth, truth, mask in pairs
             if (used := mask & (depth > 0)).any()
         ]
+        by_path = evaluate_depth(metric, truths, masks, "none")
         scores = {
             "num_keyframes": len(pairs),
             "min_confidence": self._least,
-            "by_trajectory_scale": asdict(evaluate_depth(metric, truths, masks, "none")),
+            "by_trajectory_scale": asdict(replace(by_path, scale=metres_per_unit)),
             "by_median_ratio": asdict(evaluate_depth(depths, truths, masks)),
         }
         return scores, np.array(scales)

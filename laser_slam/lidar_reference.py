@@ -117,6 +117,8 @@ def track_camera(velodyne: Velodyne, on_progress: Progress = no_progress) -> Tra
     """
     frames = np.array(list(velodyne.paths), np.int64)
     straightens = straightened(velodyne)
+    if not (straightens or velodyne.is_compensated):
+        logger.info("some frames lack scans: the motion during a turn of the scanner stays in")
     poses = []
     with closing(
         read_ahead(partial(_read, velodyne, int(f), straightens) for f in frames)
@@ -141,10 +143,6 @@ def straightened(velodyne: Velodyne) -> bool:
     gaps = np.diff(list(velodyne.paths))
     if (gaps == 1).all():
         return True
-    logger.info(
-        "scans up to %d frames apart: the motion during a turn of the scanner stays in them",
-        gaps.max(),
-    )
     return False
 
 

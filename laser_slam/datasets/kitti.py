@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from functools import partial
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from laser_slam.datasets.decoding import (
     read_image,
 )
 from laser_slam.datasets.intrinsics import check_intrinsics
+from laser_slam.datasets.kitti_calibration import odometry_rig
+from laser_slam.datasets.velodyne import Velodyne, find_scans
 from laser_slam.errors import DatasetError
 from laser_slam.types import Frame, SequenceInfo, Trajectory
 
@@ -27,6 +30,8 @@ CAMERAS = ("image_2", "image_0")  # left colour, then left grey
 DEPTH_UNITS_PER_M = 256.0
 ROOT_ADVICE = "pass --root, or set LASER_SLAM_KITTI, to the folder that holds 'sequences'"
 AGAIN = "download the sequence again"
+TR_ADVICE = "take calib.txt of KITTI's calibration download, which has it"
+logger = logging.getLogger(__name__)
 
 
 class KittiOdometry:
@@ -34,7 +39,8 @@ class KittiOdometry:
 
     The poses are optional. They are the official ones, of the left grey camera (cam0 to world,
     metres), whichever camera is used: the left colour camera sits 6 cm beside it, with parallel
-    axes. ``depth/%06d.png`` (16 bits, metres times 256, 0: unknown) is read where it is there.
+    axes. ``depth/%06d.png`` (16 bits, metres times 256, 0: unknown) is read where it is there, else
+    the true depth comes from the scans in ``velodyne`` where these are.
 
     Args:
         root: the folder that holds ``sequences``, or the one above it that holds ``dataset``.
@@ -60,6 +66,7 @@ class KittiOdometry:
         self._info = SequenceInfo(
             f"kitti-{name}", header.size, num, intrinsics, source, truth, tuple(self._paths)
         )
+        self._velodyne = self._find_velodyne()
 
     @property
     def info(self) -> SequenceInfo:
@@ -79,13 +86,35 @@ class KittiOdometry:
         """Return the (H, W) true depth z in metres, NaN: unknown; None: there is none.
 
         Raises:
-            DatasetError: the depth map is broken, not 16-bit grey, or of another size.
+            DatasetError: the depth map is broken, not 16-bit grey, or of another size; the scan
+                is broken.
         """
         path = self._folder / "depth" / f"{frame:06d}.png"
         if not path.is_file():
-            return None
+            return None if self._velodyne is None else self._velodyne.depth(frame)
         advice = "write it again, or remove the folder 'depth'"
         return read_depth(path, self._info.size, DEPTH_UNITS_PER_M, advice)
+
+    def velodyne(self) -> Velodyne:
+        """Return the LiDAR scans of the sequence, whose motion is compensated.
+
+        Raises:
+            DatasetError: there are none, or ``calib.txt`` does not say where the scanner is.
+        """
+        paths = find_scans(self._folder / "velodyne", len(self._paths))
+        calibration = self._folder / "calib.txt"
+        rig = odometry_rig(calibration, self._images_folder.name, self._info.size, TR_ADVICE)
+        return Velodyne(paths, self._times_s, rig, is_compensated=True)
+
+    def _find_velodyne(self) -> Velodyne | None:
+        """Look for scans, which most copies of KITTI lack."""
+        if not (self._folder / "velodyne").is_dir():
+            return None
+        try:
+            return self.velodyne()
+        except DatasetError as error:
+            logger.warning("no depth from LiDAR: %s", error)
+            return None
 
     def _read(self, index: int) -> Frame:
         return Frame(index, float(self._times_s[index]), read_image(self._paths[index]))
