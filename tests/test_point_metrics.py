@@ -17,6 +17,7 @@ from laser_slam.evaluation import (
     PointErrors,
     PointMap,
     PointProtocol,
+    comparable_depth,
     evaluate_points,
 )
 from laser_slam.sim3 import Sim3, rotation_exp, umeyama
@@ -233,18 +234,18 @@ def test_icp_brings_back_what_outliers_pulled_away() -> None:
 
 
 def test_only_the_central_square_is_compared_indoors() -> None:
-    truth = np.pad(wavy_surface(1)[0], ((130, 138), (120, 130), (0, 0)), mode="edge")
-    truth += 1e-3 * np.random.default_rng(0).normal(size=truth.shape)
-    found = np.full_like(truth, 1e3) * np.random.default_rng(1).normal(size=truth.shape)
-    rows, columns = truth.shape[0] // 2, truth.shape[1] // 2
-    inside = slice(rows - 112, rows + 112), slice(columns - 112, columns + 112)
+    """The square is 224 pixels of maps 518 pixels wide; garbage around it does not matter."""
+    x, y = np.meshgrid(np.linspace(-2, 2, 518), np.linspace(-1.5, 1.5, 388))
+    truth: Array = np.stack([x, y, 3 + 0.3 * np.sin(2 * x) * np.cos(3 * y)], axis=-1)
+    found: Array = 1e3 * np.random.default_rng(0).normal(size=truth.shape)
+    inside = slice(194 - 112, 194 + 112), slice(259 - 112, 259 + 112)
     found[inside] = truth[inside]
-    protocol = PointProtocol(crop_px=INDOOR_POINTS.crop_px, has_normals=False)
+    protocol = PointProtocol(crop_share=INDOOR_POINTS.crop_share, has_normals=False)
     errors = evaluate_points([PointMap(found, truth)], protocol)
     assert errors.num_truth == 224 * 224
     assert errors.chamfer_m == pytest.approx(0, abs=1e-9)
-    small = evaluate_points(noisy_maps(), INDOOR_POINTS)  # smaller than the square: all of it
-    assert small.num_truth == 3 * 12 * 14
+    half = evaluate_points([PointMap(truth[::2, ::2], truth[::2, ::2])], protocol)
+    assert half.num_truth == 112 * 112
 
 
 def test_the_least_confident_two_fifths_are_left_out_outdoors() -> None:
@@ -285,6 +286,24 @@ def test_a_hole_in_the_prediction_costs_completeness_and_not_accuracy() -> None:
     assert holed.comp_mean_m is not None
     assert holed.comp_mean_m > 0.02
     assert holed.comp_median_m == pytest.approx(0, abs=1e-9)
+
+
+def test_true_depth_beyond_ten_metres_is_not_compared_indoors() -> None:
+    depth = np.array([[0.5, 10.0, 10.1], [np.nan, 0.0, -1.0]], dtype=np.float32)
+    left = comparable_depth(depth, INDOOR_POINTS)
+    np.testing.assert_array_equal(left, [[0.5, 10.0, np.nan], [np.nan] * 3])
+    np.testing.assert_array_equal(
+        comparable_depth(depth, EVERYTHING), np.where(depth > 0, depth, np.nan)
+    )
+
+
+def test_the_deepest_fiftieth_of_all_pixels_is_not_compared_outdoors() -> None:
+    """Unknown pixels count as near: of a laser that sees every tenth pixel, a fifth goes."""
+    depth = np.zeros((100, 100), dtype=np.float32)
+    depth[:, ::10] = np.random.default_rng(0).uniform(1, 70, (100, 10))
+    left = comparable_depth(depth, OUTDOOR_POINTS)
+    assert np.isfinite(left).sum() == pytest.approx(800, abs=1)
+    assert np.nanmax(left) < np.sort(depth[depth > 0])[-199]
 
 
 def test_unknown_truth_is_not_compared() -> None:

@@ -20,6 +20,7 @@ from laser_slam.evaluation.points import (
     PointErrors,
     PointMap,
     PointProtocol,
+    comparable_depth,
     evaluate_points,
 )
 from laser_slam.evaluation.trajectory import (
@@ -59,6 +60,7 @@ __all__ = [
     "VideoDepthProtocol",
     "absolute_errors",
     "align",
+    "comparable_depth",
     "evaluate_depth",
     "evaluate_points",
     "evaluate_trajectory",

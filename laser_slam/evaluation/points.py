@@ -21,6 +21,7 @@ from laser_slam.errors import DegenerateGeometryError
 from laser_slam.sim3 import Sim3, umeyama
 
 Array = NDArray[np.float64]
+Depth = NDArray[np.float32]
 
 KEYFRAME_INTERVAL = 10  # every so many-th frame of 7-Scenes and NRGBD is predicted and compared
 
@@ -31,19 +32,25 @@ class PointProtocol:
 
     Attributes:
         icp_threshold_m: farthest partner of a point in the iterative closest point refinement.
-        crop_px: side of the central square that is compared, in pixels of the maps; None: all.
+        crop_share: side of the central square that is compared, in widths of the map; None: all.
         dropped_share: share of the pixels, those of least confidence, that is left out, in [0, 1).
         has_normals: False leaves the normals out.
+        max_depth_m: true depth beyond it is not compared: see ``comparable_depth``; None: all is.
+        far_share: share of all pixels of a frame, the deepest, whose truth is not compared.
     """
 
     icp_threshold_m: float = 0.1
-    crop_px: int | None = None
+    crop_share: float | None = None
     dropped_share: float = 0.0
     has_normals: bool = True
+    max_depth_m: float | None = None
+    far_share: float = 0.0
 
 
-INDOOR_POINTS = PointProtocol(crop_px=224)  # 7-Scenes and NRGBD, of maps 518 pixels wide
-OUTDOOR_POINTS = PointProtocol(dropped_share=0.4, has_normals=False)  # Waymo
+# 7-Scenes and NRGBD: 224 pixels of maps that are 518 wide
+INDOOR_POINTS = PointProtocol(crop_share=224 / 518, max_depth_m=10.0)
+# Waymo
+OUTDOOR_POINTS = PointProtocol(dropped_share=0.4, has_normals=False, far_share=0.02)
 
 
 @dataclass(frozen=True)
@@ -104,6 +111,26 @@ class PointErrors:
     reason: str | None = None
 
 
+def comparable_depth(depth: Depth, protocol: PointProtocol) -> Depth:
+    """Return a frame's true depth without what the protocol takes for too far to be right.
+
+    Args:
+        depth: (H, W) true depth in metres, as the data set has it, before it is resized; not
+            finite or not positive: unknown, which counts as depth 0 for ``far_share``. So where
+            a laser sees a twentieth of the pixels, a share of 0.02 are two fifths of its points.
+        protocol: what is compared.
+
+    Returns:
+        (H, W); NaN: unknown or not compared.
+    """
+    known = np.isfinite(depth) & (depth > 0)
+    if protocol.max_depth_m is not None:
+        known &= depth <= protocol.max_depth_m
+    if protocol.far_share and depth.size:
+        known &= depth <= np.percentile(np.where(known, depth, 0), 100 * (1 - protocol.far_share))
+    return np.where(known, depth, np.nan).astype(np.float32)
+
+
 def evaluate_points(maps: Iterable[PointMap], protocol: PointProtocol) -> PointErrors:
     """Compare point maps with the truth after Sim(3) alignment and ICP.
 
@@ -145,7 +172,7 @@ def _known_truth(each: PointMap, protocol: PointProtocol) -> tuple[Array, Array,
     """Return the (M, 3) points, (M, 3) truth and (M,) confidence of the pixels with truth."""
     if protocol.dropped_share and each.confidence is None:
         raise ValueError("the least confident points are to be dropped, and there is no confidence")
-    rows, columns = (_central(size, protocol.crop_px) for size in each.truth.shape[:2])
+    rows, columns = _central_square(each.truth.shape, protocol.crop_share)
     points, truth = each.points[rows, columns], each.truth[rows, columns]
     valid = np.isfinite(truth).all(axis=-1)
     found = np.where(np.isfinite(points).all(axis=-1, keepdims=True), points, np.nan)[valid]
@@ -156,11 +183,12 @@ def _known_truth(each: PointMap, protocol: PointProtocol) -> tuple[Array, Array,
     return found, truth[valid], confidence
 
 
-def _central(size: int, crop: int | None) -> slice:
-    if crop is None or crop >= size:
-        return slice(None)
-    first = size // 2 - crop // 2
-    return slice(first, first + crop)
+def _central_square(shape: tuple[int, ...], share: float | None) -> tuple[slice, slice]:
+    if share is None:
+        return slice(None), slice(None)
+    side = round(share * shape[1])
+    first = [max(size // 2 - side // 2, 0) for size in shape[:2]]
+    return slice(first[0], first[0] + side), slice(first[1], first[1] + side)
 
 
 def _cloud(points: Array) -> Any:
