@@ -4,7 +4,13 @@ from laser_slam.config.backbones import BackboneConfig, ClassicalConfig, ReplayC
 from laser_slam.config.closures import ClosuresConfig
 from laser_slam.config.fusion import FusionConfig
 from laser_slam.config.layers import LayersConfig, SegmentationConfig
-from laser_slam.config.loading import dump_config, load_config, setting_names, shipped_configs
+from laser_slam.config.loading import (
+    assigned,
+    dump_config,
+    load_config,
+    setting_names,
+    shipped_configs,
+)
 from laser_slam.config.networks import NetworkConfig, Pi3XConfig
 from laser_slam.config.places import PlacesConfig, VerificationConfig
 from laser_slam.config.sections import (
@@ -42,6 +48,7 @@ __all__ = [
     "VerificationConfig",
     "ViewerConfig",
     "WindowsConfig",
+    "assigned",
     "dump_config",
     "load_config",
     "setting_names",

@@ -23,6 +23,8 @@ def load_config(
 ) -> Config:
     """Layer the settings: code < ``configs/<name>.yaml`` < ``file`` < ``key=value`` assignments.
 
+    A ``preset`` among them names a shipped file that is laid under all of these, over ``base``.
+
     Args:
         name: of a settings file that ships with laser-slam, such as ``kitti``.
         file: a settings file of the user's.
@@ -35,14 +37,33 @@ def load_config(
     >>> load_config(assignments=["windows.size=30"]).windows.size
     30
     """
-    settings: dict[str, Any] = copy.deepcopy(dict(base or {}))
+    given: dict[str, Any] = {}
     if name is not None:
-        _merge(settings, _read_shipped(name))
+        _merge(given, _read_shipped(name))
     if file is not None:
-        _merge(settings, _read_yaml(file))
+        _merge(given, _read_yaml(file))
+    _merge(given, assigned(assignments))
+    settings: dict[str, Any] = copy.deepcopy(dict(base or {}))
+    preset = given.get("preset", settings.get("preset"))
+    if isinstance(preset, str) and preset:
+        _merge(settings, _read_preset(preset))
+    _merge(settings, given)
+    return _validate(settings)
+
+
+def assigned(assignments: Sequence[str]) -> dict[str, Any]:
+    """Nest ``section.key=value`` assignments, later ones over earlier ones.
+
+    Raises:
+        ConfigError: one is no assignment.
+
+    >>> assigned(["windows.size=30", "windows.overlap=7"])
+    {'windows': {'size': 30, 'overlap': 7}}
+    """
+    settings: dict[str, Any] = {}
     for assignment in assignments:
         _merge(settings, _parse_assignment(assignment))
-    return _validate(settings)
+    return settings
 
 
 def shipped_configs() -> Path:
@@ -95,8 +116,19 @@ def _explain_unknown(name: str, given: Any) -> str:
     return f"{name}: no such setting" + (f" (did you mean {near[0]}?)" if near else "")
 
 
+def _shipped_names() -> list[str]:
+    return sorted(path.stem for path in shipped_configs().glob("*.yaml"))
+
+
+def _read_preset(name: str) -> dict[str, Any]:
+    names = _shipped_names()
+    if name not in names:
+        raise ConfigError(f"preset: no '{name}'; there is {', '.join(names)}")
+    return _read_shipped(name)
+
+
 def _read_shipped(name: str) -> dict[str, Any]:
-    names = sorted(path.stem for path in shipped_configs().glob("*.yaml"))
+    names = _shipped_names()
     if name not in names:
         raise ConfigError(f"no settings named '{name}'; there are: {', '.join(names)}")
     return _read_yaml(shipped_configs() / f"{name}.yaml")

@@ -69,11 +69,13 @@ class RegistrationConfig(_Section):
     scale: Literal["log_huber", "huber", "l1", "closed_form"] = Field(
         "log_huber", description="estimator of the scale; closed_form: the paper's 'w/o IRLS'"
     )
-    rigid: Literal["anchors", "points"] = Field(
-        "anchors", description="what gives rotation and translation; points: 'w/o Anchor'"
+    rigid: Literal["anchors", "points", "joint"] = Field(
+        "anchors",
+        description="what gives rotation and translation; points: 'w/o Anchor'; joint: points "
+        "give the scale as well, all at once, as VGGT-Long",
     )
     huber_delta: float = Field(
-        0.1, gt=0, description="where 'huber' bends, in median ranges of the shared pixels"
+        0.1, gt=0, description="where 'huber' and 'joint' bend, in median ranges of the pixels"
     )
     anchor_length: Literal["balanced", "spread", "unit"] = Field(
         "balanced",
@@ -127,6 +129,7 @@ class RunConfig(_Section):
 class Config(_Section):
     """All settings of a run."""
 
+    preset: str = Field("", description="shipped settings that lie under all that are given")
     dataset: DatasetConfig = DatasetConfig()
     windows: WindowsConfig = WindowsConfig()
     calibration: CalibrationConfig = CalibrationConfig()

@@ -64,7 +64,7 @@ def fit_anchors(cameras: Cameras, anchor_length: str) -> Fit:
     for _round in range(_ROUNDS):
         axes = _axes(cameras, anchor_length, length)
         rigid = _kabsch(_anchors(cameras.source, axes), _anchors(cameras.target, axes), weights)
-        fit = _judge(cameras, rigid, weights, axes)
+        fit = judge(cameras, rigid, weights, axes)
         length = fit.center_sigma / fit.rotation_sigma
         weights = fit.weights
     return fit
@@ -103,7 +103,7 @@ def _anchors(poses: Array, axes: Array) -> Array:
     return np.asarray(poses[:, None, :3, 3] + axes @ np.swapaxes(poses[:, :3, :3], 1, 2))
 
 
-def _judge(cameras: Cameras, rigid: Sim3, weights: Array, axes: Array) -> Fit:
+def judge(cameras: Cameras, rigid: Sim3, weights: Array, axes: Array) -> Fit:
     """Estimate the cameras' noise from what a fit leaves, and each camera's weight in the next."""
     center = cameras.target[:, :3, 3] - rigid.apply(cameras.source[:, :3, 3])
     turned = rigid.rotation @ cameras.source[:, :3, :3]
@@ -128,7 +128,7 @@ def fit_points(cameras: Cameras, pixels: Pixels, scale: float, fit: Fit) -> Fit:
         source[here] = Sim3.from_matrix(source_pose).apply(scale * pixels.source_cam[here])
         target[here] = Sim3.from_matrix(target_pose).apply(pixels.target_cam[here])
     rigid = umeyama(source, target, with_scale=False)
-    return _judge(cameras, rigid, np.ones(len(cameras.source)), fit.axes)
+    return judge(cameras, rigid, np.ones(len(cameras.source)), fit.axes)
 
 
 def sigmas(cameras: Cameras, fit: Fit, log_scale_sigma: float) -> Array:

@@ -6,7 +6,15 @@ import numpy as np
 
 from laser_slam.config import RegistrationConfig
 from laser_slam.errors import DegenerateGeometryError
-from laser_slam.registration.cameras import Cameras, fit_anchors, fit_points, scaled, sigmas
+from laser_slam.registration.cameras import (
+    Cameras,
+    fit_anchors,
+    fit_points,
+    judge,
+    scaled,
+    sigmas,
+)
+from laser_slam.registration.joint import fit_joint
 from laser_slam.registration.scale import SCALE_ESTIMATORS, confident_pixels, log_scale_sigma
 from laser_slam.sim3 import Sim3
 from laser_slam.types import Prediction, Registration
@@ -39,7 +47,11 @@ def register(previous: Prediction, current: Prediction, config: RegistrationConf
             f"{_name(previous, current)} share {pixels.num_shared} confident pixels, "
             f"need {config.min_pixels}; lower registration.min_pixels or {_RAISE}"
         )
-    scale = SCALE_ESTIMATORS[config.scale](pixels.source, pixels.target, config)
+    if config.rigid == "joint":
+        joint = fit_joint(previous, current, in_previous, in_current, config.huber_delta)
+        scale = joint.scale
+    else:
+        scale = SCALE_ESTIMATORS[config.scale](pixels.source, pixels.target, config)
     residuals = np.log(pixels.target / (scale * pixels.source))
     cameras = Cameras(
         scaled(current.window_from_cam[in_current], scale),
@@ -49,6 +61,9 @@ def register(previous: Prediction, current: Prediction, config: RegistrationConf
     fit = fit_anchors(cameras, config.anchor_length)
     if config.rigid == "points":
         fit = fit_points(cameras, pixels, scale, fit)
+    elif config.rigid == "joint":
+        rigid = Sim3(1.0, joint.rotation, joint.translation)
+        fit = judge(cameras, rigid, np.ones(len(shared)), fit.axes)
     return Registration(
         previous_from_current=Sim3(scale, fit.rigid.rotation, fit.rigid.translation),
         sigmas=sigmas(cameras, fit, log_scale_sigma(residuals, pixels)),
