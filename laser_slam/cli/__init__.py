@@ -1,6 +1,7 @@
 """The command line: one module for each kind of command, heavy imports inside the commands."""
 
 from laser_slam.cli import (
+    bench_command,
     dataset_sources,
     export_command,
     lidar_command,
@@ -12,6 +13,7 @@ from laser_slam.cli.app import app
 
 __all__ = [
     "app",
+    "bench_command",
     "dataset_sources",
     "export_command",
     "lidar_command",

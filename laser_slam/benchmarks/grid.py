@@ -1,0 +1,131 @@
+"""Outcomes as rows and columns, beside what others have published."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from laser_slam.benchmarks.measures import (
+    MEASURES,
+    Measure,
+    Scores,
+    look_up,
+    weight,
+    why_missing,
+)
+from laser_slam.benchmarks.runner import Outcome
+from laser_slam.benchmarks.table import Block, Column, Table
+from laser_slam.evaluation import SequenceScores, failed_sequence, mean_score
+
+NOT_ASKED = "not asked for"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One number, or why there is none.
+
+    Attributes:
+        value: with the measure's factor; a word; None: there is none.
+        num: sequences that it is the mean over.
+        num_wanted: sequences that it should be the mean over.
+        digits: after the point.
+        reasons: why sequences are not in it, by name.
+    """
+
+    value: float | str | None
+    num: int = 1
+    num_wanted: int = 1
+    digits: int = 2
+    reasons: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def text(self) -> str:
+        """Return the number, and over how many of how many if it is not over all.
+
+        >>> Cell(1.234, 2, 3).text
+        '1.23 (2 of 3)'
+        """
+        if self.value is None:
+            return "-"
+        if isinstance(self.value, str):
+            return self.value
+        of = "" if self.num == self.num_wanted else f" ({self.num} of {self.num_wanted})"
+        return f"{self.value:.{self.digits}f}{of}"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line: a setting that was run, or what others have published.
+
+    Attributes:
+        source: who has published it; None: it was run.
+    """
+
+    name: str
+    cells: tuple[Cell, ...]
+    source: str | None = None
+
+
+@dataclass(frozen=True)
+class Grid:
+    """One block of a table, filled."""
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[Row, ...]
+
+
+def fill_grids(table: Table, outcomes: Sequence[Outcome]) -> list[Grid]:
+    """Put outcomes into the columns of a table.
+
+    A mean is over the sequences that have the number, and says over how many; each of the others
+    is in the cell's reasons.
+    """
+    names = list(dict.fromkeys(outcome.setting for outcome in outcomes))
+    by_place = {(outcome.setting, outcome.sequence): outcome for outcome in outcomes}
+    grids = []
+    for block in table.blocks:
+        rows = []
+        for name in names:
+            cells = []
+            for column in block.columns:
+                members = table.members(column)
+                found = [by_place.get((name, sequence)) for sequence in members]
+                cells.append(_cell(column, members, found))
+            rows.append(Row(name, tuple(cells)))
+        grids.append(Grid(block.title, block.columns, (*rows, *_published(block))))
+    return grids
+
+
+def _cell(column: Column, members: Sequence[str], outcomes: Sequence[Outcome | None]) -> Cell:
+    measure = MEASURES[column.measure]
+    rows, reasons = [], {}
+    for name, outcome in zip(members, outcomes, strict=True):
+        scores: Scores = {} if outcome is None else outcome.scores
+        value = look_up(scores, measure)
+        if value is None:
+            reasons[name] = _why(outcome, measure)
+            rows.append(failed_sequence(name, reasons[name]))
+        else:
+            found = {column.measure: value * measure.factor}
+            rows.append(SequenceScores(name, found, weight(scores, measure)))
+    mean = mean_score(rows, column.measure, is_weighted=True)
+    return Cell(mean.value, mean.num, mean.num_sequences, measure.digits, reasons)
+
+
+def _why(outcome: Outcome | None, measure: Measure) -> str:
+    if outcome is None:
+        return NOT_ASKED
+    return outcome.reason or why_missing(outcome.scores, measure)
+
+
+def _published(block: Block) -> list[Row]:
+    return [
+        Row(row.method, tuple(Cell(_as_printed(value)) for value in row.values), row.source)
+        for row in block.published
+    ]
+
+
+def _as_printed(value: float | str | None) -> str | None:
+    """Write a published number without digits that its source did not give."""
+    return value if value is None or isinstance(value, str) else f"{value:g}"

@@ -1,0 +1,112 @@
+"""What a column shows: where the number comes from, and how it is written."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+Scores = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A number of a run.
+
+    Attributes:
+        protocol: what works it out; ``run``: the run itself, as in its report.
+        path: where it stands in the result of the protocol, as ``a.b.c``.
+        digits: after the point.
+        factor: that it is written with, such as 100 for percent.
+        is_higher_better: else a lower one is.
+    """
+
+    protocol: str
+    path: str
+    digits: int = 3
+    factor: float = 1.0
+    is_higher_better: bool = False
+
+
+MEASURES = {
+    "ate_m": Measure("run", "trajectory.ate_sim3_m.rmse"),
+    "ate_without_loops_m": Measure("run", "closures.trajectory_without.ate_sim3_m.rmse"),
+    "rpe_translation_m": Measure("run", "trajectory.rpe_translation_m.rmse"),
+    "rpe_rotation_deg": Measure("run", "trajectory.rpe_rotation_deg.rmse"),
+    "t_rel_percent": Measure("run", "trajectory.kitti.t_rel_percent", 2),
+    "r_rel_deg_per_100m": Measure("run", "trajectory.kitti.r_rel_deg_per_100m"),
+    "path_m": Measure("run", "trajectory.path_length_m", 0, 1.0, True),
+    "sampled_abs_rel": Measure("run", "depth.by_median_ratio.abs_rel"),
+    "sampled_delta_percent": Measure("run", "depth.by_median_ratio.delta_125", 1, 100.0, True),
+    "coverage_percent": Measure("run", "depth.by_median_ratio.coverage", 0, 100.0, True),
+    "loops": Measure("run", "closures.accepted", 0, 1.0, True),
+    "candidates": Measure("run", "closures.candidates", 0, 1.0, True),
+    "frames": Measure("run", "frames.read", 0, 1.0, True),
+    "bridged": Measure("run", "windows.num_bridged", 0),
+    "frames_per_s": Measure("run", "frames_per_second", 2, 1.0, True),
+    "memory_mib": Measure("run", "peak_memory_mib", 0),
+    **{
+        f"{name}_{measure}": Measure(f"video_depth_{name}", path, digits, factor, is_higher_better)
+        for name in ("sintel", "bonn", "kitti")
+        for measure, path, digits, factor, is_higher_better in (
+            ("abs_rel", "abs_rel", 3, 1.0, False),
+            ("delta_percent", "delta_125", 1, 100.0, True),
+        )
+    },
+    **{
+        f"{name}_{measure}": Measure(f"points_{name}", path, 3, 1.0, path.startswith("nc"))
+        for name in ("indoor", "outdoor")
+        for measure, path in (
+            ("acc_m", "acc_mean_m"),
+            ("acc_median_m", "acc_median_m"),
+            ("comp_m", "comp_mean_m"),
+            ("comp_median_m", "comp_median_m"),
+            ("nc", "nc_mean"),
+            ("nc_median", "nc_median"),
+            ("chamfer_m", "chamfer_m"),
+        )
+    },
+}
+"""Name in a table -> what it is."""
+
+
+def look_up(scores: Scores, measure: Measure) -> float | None:
+    """Return a number of a run, without its factor; None: it has none.
+
+    >>> look_up({"run": {"frames": {"read": 3}}}, MEASURES["frames"])
+    3.0
+    """
+    found: Any = scores.get(measure.protocol)
+    for key in measure.path.split("."):
+        found = found.get(key) if isinstance(found, Mapping) else None
+    is_number = isinstance(found, int | float) and not isinstance(found, bool)
+    return float(found) if is_number and math.isfinite(found) else None
+
+
+def weight(scores: Scores, measure: Measure) -> float:
+    """Return what a run weighs in a mean: its compared pixels where depth of a video is scored."""
+    found = scores.get(measure.protocol)
+    num = found.get("num_pixels") if isinstance(found, Mapping) else None
+    return float(num) if num else 1.0
+
+
+def why_missing(scores: Scores, measure: Measure) -> str:
+    """Say why a run has no such number."""
+    found = scores.get(measure.protocol)
+    if not isinstance(found, Mapping):
+        return f"{measure.protocol} was not worked out"
+    if found.get("reason"):
+        return str(found["reason"])
+    part = found.get(measure.path.split(".")[0])
+    if isinstance(part, Mapping) and part.get("reason"):
+        return str(part["reason"])
+    return _LACKS.get(measure.path.split(".")[0], "") if part is None else _TOO_SHORT
+
+
+_TOO_SHORT = "too little of it for this score"
+_LACKS = {
+    "trajectory": "no true poses",
+    "depth": "no true depth",
+    "closures": "closures are off",
+}

@@ -1,0 +1,59 @@
+"""The rows to run: a name, and the settings in which they differ."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from laser_slam.benchmarks.table import Table
+from laser_slam.errors import ConfigError
+
+NAME = re.compile(r"[^\x00-\x1f]+")
+_NEXT = re.compile(r",(?=\s*[A-Za-z_][\w.]*=)")  # a comma inside a value is part of it
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A row: its name, and its ``section.key=value`` assignments."""
+
+    name: str
+    assignments: tuple[str, ...] = ()
+
+    @property
+    def folder(self) -> str:
+        """Return a name for its folder that every file system takes."""
+        return re.sub(r"[^\w.+-]+", "-", self.name).strip("-.") or "row"
+
+
+def parse_settings(given: Sequence[str], table: Table) -> list[Setting]:
+    """Read ``NAME=key=value,key=value``, or the name of a row of the table; none: all its rows.
+
+    Raises:
+        ConfigError: a name is missing, given twice, or alone and not that of a row.
+
+    >>> from laser_slam.benchmarks.table import load_table
+    >>> parse_settings(["short=windows.size=10,windows.overlap=3"], load_table("kitti"))
+    [Setting(name='short', assignments=('windows.size=10', 'windows.overlap=3'))]
+    """
+    if not given:
+        return [Setting(name, assignments) for name, assignments in table.rows.items()]
+    settings = [_parse(text, table) for text in given]
+    folders = [setting.folder for setting in settings]
+    for name in folders:
+        if folders.count(name) > 1:
+            raise ConfigError(f"--setting {name} is given twice, or looks so; name it otherwise")
+    return settings
+
+
+def _parse(text: str, table: Table) -> Setting:
+    name, equals, rest = (part.strip() for part in text.partition("="))
+    if not equals and name in table.rows:
+        return Setting(name, table.rows[name])
+    if not equals or not NAME.fullmatch(name):
+        rows = ", ".join(table.rows)
+        raise ConfigError(
+            f"--setting wants NAME=section.key=value,... or a row of the table ({rows}), "
+            f"got '{text}'"
+        )
+    return Setting(name, tuple(part.strip() for part in _NEXT.split(rest) if part.strip()))

@@ -1,0 +1,152 @@
+"""A table as data: its sequences, columns, rows to run and rows that others have published."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+from typing import Any, Self
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from laser_slam.benchmarks.measures import MEASURES
+from laser_slam.errors import ConfigError
+
+FOLDER = Path(__file__).parent / "tables"
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class SequenceSpec(_Part):
+    """One input of a table.
+
+    Attributes:
+        reader: name in ``laser_slam.datasets.DATASETS``, or ``path``: a drive along true poses.
+        at: places below the data folder where it may lie, the first that is there is taken;
+            none: it needs no data.
+        arguments: of the reader, after the place.
+        frames: first, end and step of the frames that are used, as a slice; none: all.
+        settings: ``section.key=value`` that this input needs.
+        note: what a reader of the table should know of it.
+    """
+
+    reader: str
+    at: tuple[str, ...] = ()
+    arguments: dict[str, Any] = {}
+    frames: tuple[int, int | None, int] | None = None
+    settings: tuple[str, ...] = ()
+    note: str = ""
+
+
+class Column(_Part):
+    """One column: the mean of a measure over some sequences, each of which counts the same.
+
+    Attributes:
+        measure: name in ``laser_slam.benchmarks.measures.MEASURES``.
+        over: a sequence, or a group of them.
+    """
+
+    name: str
+    measure: str
+    over: str
+
+
+class Published(_Part):
+    """A row that others have published: a value for each column, a word, or None."""
+
+    method: str
+    source: str
+    values: tuple[float | str | None, ...]
+
+
+class Block(_Part):
+    """Columns that stand side by side, and what others have published of them."""
+
+    title: str
+    columns: tuple[Column, ...]
+    published: tuple[Published, ...] = ()
+
+    @model_validator(mode="after")
+    def _rows_fit(self) -> Self:
+        for row in self.published:
+            if len(row.values) != len(self.columns):
+                raise ValueError(f"{row.method} has {len(row.values)} of {len(self.columns)}")
+        for column in self.columns:
+            if column.measure not in MEASURES:
+                raise ValueError(f"no measure {column.measure}; there is {', '.join(MEASURES)}")
+        return self
+
+
+class Table(_Part):
+    """A whole table.
+
+    Attributes:
+        title: one line.
+        about: what is measured and how, and what to know of the published rows.
+        settings: ``section.key=value`` of all its runs, below those of the user.
+        rows: what is compared, by name: the settings in which it differs.
+        sequences: inputs by name.
+        groups: names of sequences by the name of their group.
+        blocks: of columns.
+    """
+
+    title: str
+    about: str = ""
+    settings: tuple[str, ...] = ()
+    rows: dict[str, tuple[str, ...]] = Field(default={"ours": ()}, min_length=1)
+    sequences: dict[str, SequenceSpec]
+    groups: dict[str, tuple[str, ...]] = {}
+    blocks: tuple[Block, ...]
+
+    @model_validator(mode="after")
+    def _columns_have_sequences(self) -> Self:
+        unknown = {name for group in self.groups.values() for name in group}
+        unknown -= self.sequences.keys()
+        for column in (column for block in self.blocks for column in block.columns):
+            if column.over not in self.sequences and column.over not in self.groups:
+                unknown.add(column.over)
+        if unknown:
+            raise ValueError(f"no sequences {', '.join(sorted(unknown))}")
+        return self
+
+    def members(self, column: Column) -> tuple[str, ...]:
+        """Return the names of the sequences that a column is the mean over."""
+        return self.groups.get(column.over, (column.over,))
+
+    def measures_of(self, sequence: str) -> set[str]:
+        """Return the measures that some column wants of a sequence."""
+        columns = (column for block in self.blocks for column in block.columns)
+        return {column.measure for column in columns if sequence in self.members(column)}
+
+
+def table_names() -> list[str]:
+    """Return the names of all tables."""
+    return sorted(path.stem for path in FOLDER.glob("*.yaml"))
+
+
+def load_table(name: str) -> Table:
+    """Read a table by its name.
+
+    Raises:
+        ConfigError: there is no such table.
+    """
+    names = table_names()
+    if name not in names:
+        near = difflib.get_close_matches(name, names, n=1)
+        hint = f" (did you mean {near[0]}?)" if near else ""
+        raise ConfigError(f"no table '{name}'{hint}; there is {', '.join(names)}")
+    return parse_table((FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
+
+
+def parse_table(text: str) -> Table:
+    """Read a table from YAML.
+
+    Raises:
+        ConfigError: it is no table.
+    """
+    try:
+        return Table.model_validate(yaml.safe_load(text))
+    except (yaml.YAMLError, ValidationError) as error:
+        raise ConfigError(f"not a table: {' '.join(str(error).split())}") from error

@@ -1,0 +1,305 @@
+"""Tables of benchmarks: run once, gone on with, and honest about what has no number."""
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from laser_slam.benchmarks import (
+    Bench,
+    Material,
+    Outcome,
+    Report,
+    Setting,
+    as_csv,
+    as_markdown,
+    fill_grids,
+    load_table,
+    parse_settings,
+    save_table,
+    table_names,
+)
+from laser_slam.benchmarks.printing import list_missing
+from laser_slam.benchmarks.stretch import Stretch
+from laser_slam.benchmarks.table import parse_table
+from laser_slam.cli import app
+from laser_slam.cli.bench_command import BenchFlags
+from laser_slam.config import SyntheticConfig, load_config
+from laser_slam.datasets import DATASETS
+from laser_slam.datasets.kitti import KittiOdometry
+from laser_slam.datasets.synthetic.drive import SyntheticDrive
+from laser_slam.datasets.synthetic.save import save_kitti_layout
+from laser_slam.errors import ConfigError, DatasetError
+
+NUM_FRAMES = 14
+SIMULATED = [
+    "backbone.name=simulated", "backbone.simulated.width=126", "windows.size=8",
+    "windows.overlap=3", "windows.min_parallax_px=0", "run.samples=2", "fusion.stride=4",
+]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("draw_findings", "stages_picture"):
+        monkeypatch.setattr(f"laser_slam.pipeline.{name}", lambda *_: None)
+    monkeypatch.delenv("LASER_SLAM_DATA", raising=False)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data folder that holds KITTI 03, in miniature, and none of the others."""
+    root = tmp_path_factory.mktemp("data")
+    config = SyntheticConfig(num_frames=NUM_FRAMES, width=126, height=56)
+    save_kitti_layout(SyntheticDrive(config), root / "kitti_odometry", "03")
+    return root
+
+
+@pytest.fixture(scope="module")
+def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+    """A table of two rows, run by the command line."""
+    out = tmp_path_factory.mktemp("bench") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("draw_findings", "stages_picture"):
+            patch.setattr(f"laser_slam.pipeline.{name}", lambda *_: None)
+        return out, bench(data, out)
+
+
+def bench(data: Path, out: Path, *more: str) -> Result:
+    arguments = ["bench", "kitti", "--only", "03,04", "--data", str(data), "--out", str(out)]
+    arguments += ["--quiet", "--page", str(out / "page.md"), "--setting", "ours="]
+    arguments += ["--setting", "no loops=closures.enabled=false,layers.enabled=never"]
+    more = tuple(part for name in SIMULATED for part in ("--set", name)) + more
+    return CliRunner().invoke(app, [*arguments, *more], env={"COLUMNS": "300"})
+
+
+def test_a_table_runs_and_stands_beside_what_others_published(
+    finished: tuple[Path, Result],
+) -> None:
+    out, result = finished
+    assert result.exit_code == 0, result.output
+    for words in ("ATE RMSE, m", "ours", "no loops", "LASER (pi3)", "24.17", "(1 of 11)"):
+        assert words in result.stdout, words
+    assert {path.name for path in out.iterdir()} == {
+        "kitti.md", "kitti.csv", "page.md", "ours", "no-loops"
+    }  # fmt: skip
+
+
+def test_the_numbers_are_those_of_the_reports(finished: tuple[Path, Result]) -> None:
+    out, _ = finished
+    lines = list(csv.DictReader(io.StringIO((out / "kitti.csv").read_text())))
+    for method, folder in (("ours", "ours"), ("no loops", "no-loops")):
+        report = json.loads((out / folder / "03" / "report.json").read_text())
+        found = {
+            (line["column"], line["num"], line["num_wanted"]): float(line["value"])
+            for line in lines
+            if line["method"] == method and line["measure"] == "ate_m" and line["value"]
+        }
+        ate = report["trajectory"]["ate_sim3_m"]["rmse"]
+        assert found == {
+            ("Avg.", "1", "11"): pytest.approx(ate),
+            ("Avg.*", "1", "10"): pytest.approx(ate),
+            ("03", "1", "1"): pytest.approx(ate),
+        }
+        assert ate > 0
+
+
+def test_what_has_no_data_is_a_row_that_says_so(finished: tuple[Path, Result]) -> None:
+    text = (finished[0] / "kitti.md").read_text()
+    (line,) = (line for line in text.splitlines() if "no KITTI sequence 04" in line)
+    assert line.startswith("| ours, no loops | 04 |")
+    assert "| 03 | t_rel_percent: too little of it for this score |" in text
+    assert "00, 01, 02, 05" in text  # not asked for
+
+
+def test_finished_runs_are_not_run_again(data: Path, finished: tuple[Path, Result]) -> None:
+    out, first = finished
+    reports = {path: path.stat().st_mtime_ns for path in out.rglob("report.json")}
+    assert len(reports) == 2
+    again = bench(data, out)
+    assert again.stdout == first.stdout
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("report.json")} == reports
+
+
+def test_a_finished_run_of_other_settings_is_no_number(
+    data: Path, finished: tuple[Path, Result]
+) -> None:
+    out, _ = finished
+    assert bench(data, out, "--set", "windows.size=9").exit_code == 0
+    text = (out / "kitti.md").read_text()
+    assert "RUNS/ours/03 holds a run with other settings: windows.size (8, now 9)" in text
+    assert str(out) not in text
+    bench(data, out)  # leaves the files as they were
+
+
+def test_the_page_holds_each_table_once_with_its_command(finished: tuple[Path, Result]) -> None:
+    text = (finished[0] / "page.md").read_text()
+    assert text.count("## KITTI odometry") == 1
+    assert "laser-slam bench kitti --only 03,04 --setting ours=" in text
+    assert "--data DATA" in text
+    assert str(finished[0]) not in text
+    report = Report("other", load_table("kitti"), [], [], "laser-slam bench other")
+    page = finished[0] / "page.md"
+    save_table(finished[0] / "other", report, page)
+    save_table(finished[0] / "other", report, page)
+    both = page.read_text()
+    assert both.startswith(text.rstrip())
+    assert both.count("laser-slam bench other") == 1
+    page.write_text(text)
+
+
+def test_every_shipped_table_can_be_run_as_it_stands() -> None:
+    """Its rows are settings that exist, its readers are there, and its values fit its columns."""
+    assert {"here", "kitti"} <= set(table_names())
+    for name in table_names():
+        table = load_table(name)
+        for setting in parse_settings([], table):
+            load_config(assignments=[*table.settings, *setting.assignments])
+        for sequence in table.sequences.values():
+            load_config(assignments=sequence.settings)
+            assert sequence.reader in {*DATASETS, "path"}
+        for block in table.blocks:
+            assert all(row.source for row in block.published)
+
+
+@pytest.mark.parametrize("method", ["LASER (pi3)", "VGGT-Long", "pi3-Long"])
+def test_published_means_are_the_means_of_their_columns(method: str) -> None:
+    """A value that was copied wrongly would move the mean away from the published one."""
+    (row,) = (row for row in load_table("kitti").blocks[0].published if row.method == method)
+    values = [float(value) for value in row.values if isinstance(value, float | int)]
+    assert len(values) == 13
+    assert sum(values[2:]) / 11 == pytest.approx(values[0], abs=0.006)
+    assert (sum(values[2:]) - values[3]) / 10 == pytest.approx(values[1], abs=0.006)
+
+
+def outcome(name: str, ate: float | None, reason: str | None = None) -> Outcome:
+    scores = {"run": {"trajectory": {"ate_sim3_m": {"rmse": ate}}}}
+    return Outcome("ours", name, {} if reason else scores, reason)
+
+
+def test_a_mean_is_over_what_has_a_number_and_says_over_how_many() -> None:
+    table = load_table("kitti")
+    outcomes = [outcome("00", 2.0), outcome("01", 100.0), outcome("02", None, "lost its way")]
+    row = fill_grids(table, outcomes)[0].rows[0]
+    assert [cell.text for cell in row.cells[:5]] == [
+        "51.000 (2 of 11)", "2.000 (1 of 10)", "2.000", "100.000", "-"
+    ]  # fmt: skip
+    assert row.cells[0].reasons["02"] == "lost its way"
+    assert row.cells[0].reasons["05"] == "not asked for"
+
+
+def test_depth_of_videos_is_averaged_by_pixels() -> None:
+    table = parse_table("""
+        title: two videos
+        sequences: {a: {reader: images}, b: {reader: images}}
+        groups: {both: [a, b]}
+        blocks:
+          - {title: t, columns: [{name: c, measure: bonn_abs_rel, over: both}]}
+        """)
+    outcomes = [
+        Outcome("ours", name, {"video_depth_bonn": {"abs_rel": error, "num_pixels": pixels}})
+        for name, error, pixels in (("a", 0.1, 3000), ("b", 0.5, 1000))
+    ]
+    assert fill_grids(table, outcomes)[0].rows[0].cells[0].value == pytest.approx(0.2)
+
+
+def test_markdown_and_csv_say_what_is_missing_and_escape_it() -> None:
+    table = load_table("kitti")
+    outcomes = [outcome("00", 2.0), outcome("01", None, "a | b,\nc")]
+    grids = fill_grids(table, outcomes)
+    assert "| ours | 01 | a \\| b, c |" in as_markdown(grids, outcomes)
+    lines = list(csv.DictReader(io.StringIO(as_csv("kitti", grids))))
+    (line,) = (one for one in lines if one["column"] == "01" and one["measure"] == "ate_m"
+               and one["method"] == "ours")  # fmt: skip
+    assert (line["value"], line["num"], line["missing"]) == ("", "0", "01: a | b,\nc")
+    assert ("ours", "01", "a | b,\nc") in list(list_missing(grids, outcomes))
+
+
+def test_what_breaks_a_run_is_a_reason_and_the_rest_goes_on(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise RuntimeError("CUDA out of memory")
+
+    monkeypatch.setattr("laser_slam.benchmarks.runner.Pipeline", full)
+    work = Bench(load_table("kitti"), Material(data), tmp_path, only=("02", "03"))
+    found = work.run([Setting("ours")])
+    assert [(one.sequence, one.reason) for one in found][1] == (
+        "03",
+        "RuntimeError: CUDA out of memory",
+    )
+    assert found[0].reason is not None
+
+
+def test_without_data_the_reason_says_how_to_pass_it(tmp_path: Path) -> None:
+    work = Bench(load_table("kitti"), Material(None), tmp_path, only=("03",))
+    (found,) = work.run([Setting("ours")])
+    assert found.reason is not None
+    assert "pass --data, or set LASER_SLAM_DATA" in found.reason
+    work = Bench(load_table("kitti"), Material(tmp_path / "nowhere"), tmp_path, only=("03",))
+    assert "no kitti_odometry" in str(work.run([Setting("ours")])[0].reason)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("=windows.size=3", "--setting wants NAME=section.key=value"),
+        ("nothing", "or a row of the table (ours, vggt-long), got 'nothing'"),
+    ],
+)
+def test_a_wrong_setting_is_refused(text: str, words: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        parse_settings([text], load_table("kitti"))
+    assert words in str(error.value)
+
+
+def test_rows_that_would_share_a_folder_are_refused() -> None:
+    with pytest.raises(ConfigError, match="given twice"):
+        parse_settings(["w/o LSA=", "w o LSA="], load_table("kitti"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["kiti"], "no table 'kiti' (did you mean kitti?); there is "),
+        (["kitti", "--only", "99"], "--only 99: no such sequence; there is all"),
+        (["kitti", "--setting", "a=windows.sise=3"], "windows.sise: no such setting"),
+    ],
+)
+def test_a_wrong_command_is_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    result = CliRunner().invoke(app, ["bench", *arguments, "--out", str(out), "--quiet"])
+    assert result.exit_code == 1
+    assert words in result.stderr
+    assert not out.exists()
+
+
+def test_the_users_settings_lie_over_the_tables_and_under_the_rows() -> None:
+    flags = BenchFlags(set=["windows.size=11", "windows.overlap=4"], backbone="simulated")
+    config = flags.resolve(["windows.size=9", "run.samples=3"], ["windows.overlap=5"])
+    assert (config.windows.size, config.windows.overlap, config.run.samples) == (11, 5, 3)
+    assert config.backbone.name == "simulated"
+
+
+def test_a_stretch_is_a_data_set_of_its_own(data: Path) -> None:
+    whole = KittiOdometry(data / "kitti_odometry", "03")
+    part = Stretch(whole, 2, 11, 3)
+    frames = list(part.frames())
+    assert [frame.index for frame in frames] == [0, 1, 2]
+    assert [frame.time_s for frame in frames] == pytest.approx([0.2, 0.5, 0.8])
+    assert part.info.num_frames == 3
+    assert [path.stem for path in part.info.files] == ["000002", "000005", "000008"]
+    truth, of_whole = part.info.truth, whole.info.truth
+    assert truth is not None
+    assert of_whole is not None
+    assert truth.frames.tolist() == [0, 1, 2]
+    assert (truth.world_from_cam[1] == of_whole.world_from_cam[5]).all()
+    depth, same = part.true_depth(2), whole.true_depth(8)
+    assert depth is not None
+    assert same is not None
+    np.testing.assert_array_equal(depth, same)
+    with pytest.raises(DatasetError, match="14 frames, none from 20 on"):
+        Stretch(whole, 20, None, 1)
