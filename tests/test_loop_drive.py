@@ -1,8 +1,9 @@
 """A rendered drive around a block, seen by simulated networks: a run closes its loop."""
 
-from collections.abc import Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +15,9 @@ from laser_slam.backbones.base import Backbone
 from laser_slam.closures import ClosureRecord, read_closures
 from laser_slam.config import Config, SyntheticConfig, load_config
 from laser_slam.datasets.synthetic.drive import SyntheticDrive
-from laser_slam.fusion import fuse
 from laser_slam.pipeline import Pipeline
-from laser_slam.results import Results
+from laser_slam.results import Results, fuse_run
+from laser_slam.store import TileFiles
 from laser_slam.types import Frame, Image, Prediction, SequenceInfo, Submap
 
 SETTINGS = [
@@ -117,20 +118,22 @@ class World:
         network = Network(self.drive, self.answers, interrupt_at)
         fused_at: dict[int, NDArray[np.float64]] = {}
 
-        def note(submaps: Iterable[Submap]) -> Iterator[Submap]:
-            for submap in submaps:
+        def fuse_noting(*arguments: Any) -> TileFiles:
+            *others, see = arguments
+
+            def note(submap: Submap) -> None:
                 for i in np.flatnonzero(submap.is_owned):
                     pose = submap.places[i].apply_poses(submap.prediction.window_from_cam[i])
                     fused_at[int(submap.prediction.frames[i])] = pose
-                yield submap
+                see(submap)
+
+            return fuse_run(*others, note)
 
         with pytest.MonkeyPatch.context() as patch:
             for name in dir(laser_slam.pipeline):
                 if name.startswith("draw_") or name == "stages_picture":
                     patch.setattr(laser_slam.pipeline, name, lambda *_: None)
-            patch.setattr(
-                laser_slam.pipeline, "fuse", lambda maps, settings: fuse(note(maps), settings)
-            )
+            patch.setattr(laser_slam.pipeline, "fuse_run", fuse_noting)
             results = Pipeline(self.drive, config, folder, backbone=network).run()
         path = folder / "closures.json"
         return Run(results, read_closures(path) if path.exists() else [], network, fused_at)
