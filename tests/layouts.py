@@ -1,0 +1,267 @@
+"""The corridor, written as the published data sets lay their sequences out."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from corridor import SIZE, true_intrinsics, true_pose, view
+from image_files import write_png
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from laser_slam.datasets.base import Dataset
+from laser_slam.datasets.bonn import Bonn
+from laser_slam.datasets.kitti_depth import KittiDepth
+from laser_slam.datasets.nrgbd import Nrgbd
+from laser_slam.datasets.scannet import ScanNet
+from laser_slam.datasets.sintel import Sintel
+from laser_slam.datasets.tum_rgbd import TumRgbd
+from laser_slam.datasets.waymo import Waymo
+
+Array = NDArray[np.float64]
+
+T0 = 1311868164.363181  # seconds of the epoch, as TUM's times are
+DAY, DRIVE = "2011_09_26", "2011_09_26_drive_0002_sync"
+SEGMENT = "segment-183829460855609442_430_000_450_000_with_camera_labels.tfrecord"
+FIRST_DEPTH = 5  # KITTI: the first five images of a drive have none
+
+
+def counts(frame: int, units_per_m: float) -> NDArray[np.uint16]:
+    """Return the depth as 16-bit numbers, 0 where they do not reach."""
+    stored = np.rint(view(frame)[1].astype(np.float64) * units_per_m)
+    return np.where(stored <= 65535, stored, 0).astype(np.uint16)
+
+
+def write_jpg(path: Path, image: NDArray[np.uint8]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    sharp = [cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_JPEG_SAMPLING_FACTOR]
+    full_color = cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444
+    assert cv2.imwrite(str(path), image[..., ::-1], [*sharp, full_color])
+
+
+def write_text(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data)
+
+
+def write_matrix(path: Path, matrix: Array) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savetxt(path, matrix, fmt="%.12g")
+
+
+def write_exr(path: Path, pixels: NDArray[np.float32]) -> None:
+    """Write one channel of float32 in blocks of 16 lines, deflated where that shrinks them."""
+    height, width = pixels.shape
+    box = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    attributes = {
+        ("channels", "chlist"): b"Y\0" + struct.pack("<iB3xii", 2, 0, 1, 1) + b"\0",
+        ("compression", "compression"): b"\3",
+        ("dataWindow", "box2i"): box,
+        ("displayWindow", "box2i"): box,
+        ("lineOrder", "lineOrder"): b"\0",
+        ("pixelAspectRatio", "float"): struct.pack("<f", 1),
+        ("screenWindowCenter", "v2f"): bytes(8),
+        ("screenWindowWidth", "float"): struct.pack("<f", 1),
+    }
+    data = b"\x76\x2f\x31\x01" + struct.pack("<i", 2)
+    for (name, kind), value in attributes.items():
+        data += f"{name}\0{kind}\0".encode() + struct.pack("<i", len(value)) + value
+    blocks = [
+        struct.pack("<2i", row, len(packed)) + packed
+        for row in range(0, height, 16)
+        for packed in [_packed(pixels[row : row + 16].astype("<f4").tobytes())]
+    ]
+    ends = np.cumsum([len(data) + 1 + 8 * len(blocks), *map(len, blocks)])
+    write_bytes(path, data + b"\0" + struct.pack(f"<{len(blocks)}q", *ends[:-1]) + b"".join(blocks))
+
+
+def _packed(raw: bytes) -> bytes:
+    mixed = np.frombuffer(raw[0::2] + raw[1::2], np.uint8)
+    steps = np.diff(mixed, prepend=np.uint8(0)).astype(np.uint8)
+    steps[1:] += np.uint8(128)
+    packed = zlib.compress(steps.tobytes())
+    return packed if len(packed) < len(raw) else raw
+
+
+def tum(folder: Path, num: int, pose_of: Callable[[int], Array] = true_pose) -> None:
+    """Write rgb, depth and a trajectory, each with a clock of its own and rows between."""
+    rgb, depth, truth = [], [], []
+    for frame in range(num):
+        time = T0 + frame / 30
+        write_png(folder / "rgb" / f"{time:.6f}.png", view(frame)[0])
+        write_png(folder / "depth" / f"{time + 0.012:.6f}.png", counts(frame, 5000))
+        rgb.append(f"{time:.6f} rgb/{time:.6f}.png")
+        depth.append(f"{time + 0.012:.6f} depth/{time + 0.012:.6f}.png")
+        pose = pose_of(frame)
+        numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        truth.append(f"{time + 0.003:.6f} " + " ".join(f"{number:.9f}" for number in numbers))
+        truth.append(f"{time + 0.016:.6f} 9 9 9 0 0 0 1")  # of no image
+    for name, lines in {"rgb": rgb, "depth": depth, "groundtruth": truth}.items():
+        write_text(folder / f"{name}.txt", "\n".join(["# title", "# file: x.bag", *lines]) + "\n")
+
+
+def bonn(folder: Path, num: int) -> None:
+    turned = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    published = np.array(
+        [[1.0157, 0.1828, -0.2389], [0.0009, -0.8431, -0.6413], [-0.3009, 0.6147, -0.8085]]
+    )
+    markers_from_cam = np.eye(4)
+    markers_from_cam[:3, :3] = Rotation.from_matrix(
+        published / np.cbrt(np.linalg.det(published))
+    ).as_matrix()
+    markers_from_cam[:3, 3] = [0.0113, -0.0098, 0.0111]
+    back = np.linalg.inv(turned @ markers_from_cam)
+    tum(folder, num, lambda frame: np.asarray(turned @ true_pose(frame) @ back))
+
+
+def scannet(folder: Path, num: int) -> None:
+    for frame in range(num):
+        write_jpg(folder / "color" / f"{frame}.jpg", view(frame)[0])
+        write_png(folder / "depth" / f"{frame}.png", counts(frame, 1000)[1::2, 1::2])
+        write_matrix(folder / "pose" / f"{frame}.txt", true_pose(frame))
+    matrix = np.eye(4)
+    matrix[:3, :3] = true_intrinsics()
+    write_matrix(folder / "intrinsic" / "intrinsic_color.txt", matrix)
+
+
+def nrgbd(folder: Path, num: int) -> None:
+    poses = []
+    for frame in range(num):
+        write_png(folder / "images" / f"img{frame}.png", view(frame)[0])
+        write_png(folder / "depth" / f"depth{frame}.png", counts(frame, 1000))
+        poses.append(true_pose(frame) * [1, -1, -1, 1])  # columns: x, y, z, place
+    write_matrix(folder / "poses.txt", np.concatenate(poses))
+    write_text(folder / "focal.txt", f"{true_intrinsics()[0, 0]}\n")
+
+
+def sintel(folder: Path, num: int) -> None:
+    training, name = folder.parent.parent, folder.name
+    tag = struct.pack("<f", 202021.25)
+    for frame in range(num):
+        stem = f"frame_{frame + 1:04d}"
+        write_png(folder / f"{stem}.png", view(frame)[0])
+        head = tag + struct.pack("<2i", SIZE[1], SIZE[0])
+        depth = view(frame)[1].astype("<f4")
+        write_bytes(training / "depth" / name / f"{stem}.dpt", head + depth.tobytes())
+        cam_from_world = np.linalg.inv(true_pose(frame))[:3]
+        camera = true_intrinsics().tobytes() + np.ascontiguousarray(cam_from_world).tobytes()
+        write_bytes(training / "camdata_left" / name / f"{stem}.cam", tag + camera)
+
+
+def waymo(folder: Path, num: int) -> None:
+    for frame in range(num):
+        stem = folder / f"{frame:05d}_1"
+        write_jpg(stem.with_suffix(".jpg"), view(frame)[0])
+        write_jpg(folder / f"{frame:05d}_2.jpg", view(frame)[0][:, ::-1])
+        write_exr(stem.with_suffix(".exr"), scanned(frame))
+        np.savez(
+            stem.with_suffix(".npz"),
+            intrinsics=true_intrinsics(),
+            cam2world=true_pose(frame),
+            distortion=np.zeros(5),
+        )
+
+
+def scanned(frame: int) -> NDArray[np.float32]:
+    """Return the depth where a LiDAR would hit, 0 elsewhere."""
+    hits = np.random.default_rng(frame).random(SIZE) < 0.2
+    return np.where(hits, view(frame)[1], 0).astype(np.float32)
+
+
+def kitti_depth(folder: Path, num: int) -> None:
+    """Write a drive of which the first and last five images have no depth."""
+    day = folder.parent.parent / "raw" / DAY
+    images = day / DRIVE / "image_02" / "data"
+    for number in range(num + 2 * FIRST_DEPTH):
+        write_png(images / f"{number:010d}.png", view(number - FIRST_DEPTH)[0])
+    for frame in range(num):
+        path = folder / "proj_depth" / "groundtruth" / "image_02"
+        write_png(path / f"{frame + FIRST_DEPTH:010d}.png", counts(frame, 256))
+    row = np.column_stack([true_intrinsics(), [44.9, 0.2, 0.003]]).ravel()
+    numbers = " ".join(f"{number:.9e}" for number in row)
+    write_text(day / "calib_cam_to_cam.txt", f"calib_time: 09-Jan-2012\nP_rect_02: {numbers}\n")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How one data set is written and opened, and what is known of what comes out."""
+
+    write: Callable[[Path, int], None]
+    open: Callable[[Path], Dataset]
+    place: str
+    name: str
+    fps: float
+    unit_m: float = 1e-6  # step of its depth numbers
+    reach_m: float = np.inf
+    has_poses: bool = True
+    has_own_lens: bool = True
+    is_lossy: bool = False
+
+
+LAYOUTS = {
+    "tum-rgbd": Layout(
+        tum,
+        TumRgbd,
+        "rgbd_dataset_freiburg3_corridor",
+        "tum-freiburg3_corridor",
+        30,
+        1 / 5000,
+        13.107,
+        has_own_lens=False,
+    ),
+    "bonn": Layout(
+        bonn,
+        Bonn,
+        "rgbd_bonn_corridor",
+        "bonn-corridor",
+        30,
+        1 / 5000,
+        13.107,
+        has_own_lens=False,
+    ),
+    "scannet": Layout(
+        scannet, ScanNet, "scene0707_00", "scannet-scene0707_00", 30, 1e-3, is_lossy=True
+    ),
+    "nrgbd": Layout(nrgbd, Nrgbd, "corridor", "nrgbd-corridor", 30, 1e-3),
+    "sintel": Layout(sintel, Sintel, "training/final/alley_2", "sintel-final-alley_2", 24),
+    "waymo": Layout(
+        waymo,
+        Waymo,
+        SEGMENT,
+        "waymo-183829460855609442_430_000_450_000-front",
+        10,
+        is_lossy=True,
+    ),
+    "kitti-depth": Layout(
+        kitti_depth,
+        KittiDepth,
+        f"val/{DRIVE}",
+        "kitti-depth-2011_09_26_drive_0002",
+        10,
+        1 / 256,
+        has_poses=False,
+    ),
+}
+
+
+def write_layout(key: str, root: Path, num: int) -> Path:
+    """Write a miniature and return the folder that a user would give."""
+    layout = LAYOUTS[key]
+    folder = root / layout.place
+    layout.write(folder, num)
+    return folder
+
+
+def open_layout(key: str, root: Path, num: int) -> Dataset:
+    return LAYOUTS[key].open(write_layout(key, root, num))
