@@ -263,7 +263,10 @@ def test_the_least_confident_two_fifths_are_left_out_outdoors() -> None:
 
 def test_what_is_not_predicted_is_dropped_before_the_least_confident() -> None:
     maps = noisy_maps(num=1)
-    maps[0].points[:3] = np.nan
+    maps[0].points[:2] = np.nan
+    confidence = maps[0].confidence
+    assert confidence is not None
+    confidence[2] = np.nan
     errors = evaluate_points(maps, OUTDOOR_POINTS)
     assert errors.num_points == errors.num_truth
     assert errors.num_truth == pytest.approx(0.6 * 12 * 14, abs=1)

@@ -191,6 +191,8 @@ def test_depth_is_resized_as_the_protocol_does() -> None:
     cubic = cv2.resize(depth, (75, 64), interpolation=cv2.INTER_CUBIC)
     np.testing.assert_array_equal(resize_depth(depth, (64, 75)), cubic)
     assert resize_depth(depth, (20, 30)) is depth
+    half = resize_depth(depth.astype(np.float16), (64, 75))
+    np.testing.assert_allclose(half, cubic, rtol=2e-3)
 
 
 def test_an_unknown_pixel_stays_one_pixel_when_resized() -> None:

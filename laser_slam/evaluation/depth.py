@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Depth = NDArray[np.float32]
+AnyDepth = NDArray[np.float32] | NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Alignment = Literal["median", "least_squares", "none"]
 
@@ -57,8 +58,8 @@ def evaluate_depth(
     chosen = np.ones(found.shape, dtype=bool) if mask is None else _flat(mask).astype(bool)
     if found.shape != true.shape or found.shape != chosen.shape:
         raise ValueError(f"depth {found.shape}, truth {true.shape}, mask {chosen.shape} pixels")
-    has_truth = _is_known(true)
-    compared = chosen & has_truth & _is_known(found)
+    has_truth = is_known(true)
+    compared = chosen & has_truth & is_known(found)
     num_true, num = int(has_truth.sum()), int(compared.sum())
     coverage = num / num_true if num_true else None
     if num == 0:
@@ -80,7 +81,8 @@ def _flat(maps: Depth | Mask | Sequence[Depth] | Sequence[Mask]) -> NDArray[np.f
     return np.concatenate([np.empty(0), *(np.ravel(part) for part in maps)]).astype(np.float64)
 
 
-def _is_known(depth: NDArray[np.float64]) -> Mask:
+def is_known(depth: AnyDepth) -> Mask:
+    """Tell where depth of any shape is finite and positive."""
     return np.isfinite(depth) & (depth > 0)
 
 

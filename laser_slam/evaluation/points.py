@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from laser_slam.dependencies import import_open3d
 from laser_slam.errors import DegenerateGeometryError
+from laser_slam.evaluation.depth import is_known
 from laser_slam.sim3 import Sim3, umeyama
 
 Array = NDArray[np.float64]
@@ -123,7 +124,7 @@ def comparable_depth(depth: Depth, protocol: PointProtocol) -> Depth:
     Returns:
         (H, W); NaN: unknown or not compared.
     """
-    known = np.isfinite(depth) & (depth > 0)
+    known = is_known(depth)
     if protocol.max_depth_m is not None:
         known &= depth <= protocol.max_depth_m
     if protocol.far_share and depth.size:
@@ -179,7 +180,8 @@ def _known_truth(each: PointMap, protocol: PointProtocol) -> tuple[Array, Array,
     if each.confidence is None:
         return found, truth[valid], np.empty(0)
     confidence = each.confidence[rows, columns][valid].astype(np.float64)
-    confidence[np.isnan(found[:, 0])] = -1.0  # what is not predicted is dropped first
+    # What is not predicted, or nothing is known of, is dropped first.
+    confidence[np.isnan(found[:, 0]) | np.isnan(confidence)] = -1.0
     return found, truth[valid], confidence
 
 

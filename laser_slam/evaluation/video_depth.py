@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from laser_slam.evaluation.depth import is_known
+
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 DepthPairs = Callable[[], Iterable[tuple[Depth | None, Depth]]]
@@ -110,9 +112,10 @@ def resize_depth(depth: Depth, size: tuple[int, int]) -> Depth:
     """
     if depth.shape == size:
         return depth
-    cubic = cv2.resize(depth, size[::-1], interpolation=cv2.INTER_CUBIC)
-    nearest = cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
-    return np.asarray(np.where(_is_known(cubic), cubic, nearest), dtype=np.float32)
+    source = depth.astype(np.float32, copy=False)  # from half precision, which OpenCV lacks
+    cubic = cv2.resize(source, size[::-1], interpolation=cv2.INTER_CUBIC)
+    nearest = cv2.resize(source, size[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+    return np.asarray(np.where(is_known(cubic), cubic, nearest), dtype=np.float32)
 
 
 class _ComparedPixels:
@@ -141,17 +144,13 @@ class _ComparedPixels:
 
     def _read(self) -> Iterator[tuple[Depth, Depth, int]]:
         for depth, truth in self._pairs():
-            has_truth = _is_known(truth) & (truth < self._ceiling)
+            has_truth = is_known(truth) & (truth < self._ceiling)
             if depth is None:
                 yield np.empty(0, np.float32), np.empty(0, np.float32), int(has_truth.sum())
                 continue
             found = resize_depth(depth, (truth.shape[0], truth.shape[1]))
-            compared = has_truth & _is_known(found)
+            compared = has_truth & is_known(found)
             yield found[compared], truth[compared], int(has_truth.sum())
-
-
-def _is_known(depth: Depth) -> NDArray[np.bool_]:
-    return np.isfinite(depth) & (depth > 0)
 
 
 def _scale(pixels: _ComparedPixels) -> float:
