@@ -19,6 +19,13 @@ NUM = 4
 Spoil = Callable[[Path], object]
 
 
+def remove(name: str) -> Spoil:
+    def spoil(folder: Path) -> None:
+        (folder / name).unlink()
+
+    return spoil
+
+
 def replace_line(name: str, number: int, line: str) -> Spoil:
     def spoil(folder: Path) -> None:
         lines = (folder / name).read_text().splitlines()
@@ -51,7 +58,7 @@ def beside(folder: Path, *parts: str) -> Path:
 FAULTS: dict[str, tuple[str, Spoil, str]] = {
     "tum: no list of images": (
         "tum-rgbd",
-        lambda folder: (folder / "rgb.txt").unlink(),
+        remove("rgb.txt"),
         "no rgb.txt in .*; give the folder of one sequence",
     ),
     "tum: an empty list": (
@@ -89,9 +96,9 @@ FAULTS: dict[str, tuple[str, Spoil, str]] = {
         shift_times("depth.txt"),
         "no time in .*depth.txt is within 20 ms of an image",
     ),
-    "tum: the first image is missing": (
+    "tum: the first image is empty": (
         "tum-rgbd",
-        lambda folder: min((folder / "rgb").iterdir()).unlink(),
+        lambda folder: cut_file(min((folder / "rgb").iterdir()), 0.0),
         "the first image of .* cannot be read",
     ),
     "bonn: images of two sizes": (
@@ -106,7 +113,7 @@ FAULTS: dict[str, tuple[str, Spoil, str]] = {
     ),
     "scannet: an empty folder": (
         "scannet",
-        lambda folder: [path.unlink() for path in (folder / "color").iterdir()],
+        lambda folder: [path.rename(folder / path.name) for path in (folder / "color").iterdir()],
         "no images such as 0.jpg in .*color; give the folder of one exported scene",
     ),
     "scannet: a pose of three rows": (
@@ -149,7 +156,7 @@ FAULTS: dict[str, tuple[str, Spoil, str]] = {
     ),
     "waymo: no camera": (
         "waymo",
-        lambda folder: (folder / "00002_1.npz").unlink(),
+        remove("00002_1.npz"),
         "cannot read the camera .*00002_1.npz .No such file",
     ),
     "waymo: a cut camera": (

@@ -80,7 +80,8 @@ def test_depth_is_in_metres_and_unknown_where_the_file_says_nothing(key: str, ro
     for frame in range(NUM):
         depth = dataset.true_depth(frame)
         assert depth is not None
-        assert (depth.dtype, depth.shape) == (np.float32, SIZE)
+        assert depth.dtype == np.float32
+        assert depth.shape == SIZE
         pixels = (slice(1, None, 2),) * 2 if key == "scannet" else (slice(None),) * 2
         true = (scanned(frame) if key == "waymo" else view(frame)[1])[pixels]
         known = (true > 0) & (true < layout.reach_m)

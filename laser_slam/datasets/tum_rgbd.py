@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from laser_slam.camera import intrinsics_matrix
 from laser_slam.datasets.decoding import read_depth
@@ -143,8 +144,6 @@ def _times(path: Path, rows: list[tuple[int, list[str]]], columns: int) -> Array
 
 
 def _pose(path: Path, number: int, words: list[str]) -> Array | None:
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (import time)
-
     try:
         values = np.array([float(word) for word in words[1:8]])
     except ValueError as error:
