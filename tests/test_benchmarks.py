@@ -153,7 +153,7 @@ def test_the_page_holds_each_table_once_with_its_command(finished: tuple[Path, R
 
 def test_every_shipped_table_can_be_run_as_it_stands() -> None:
     """Its rows are settings that exist, its readers are there, and its values fit its columns."""
-    assert {"here", "kitti"} <= set(table_names())
+    assert {"here", "kitti", "depth", "pose", "points", "waymo", "ablation"} <= set(table_names())
     for name in table_names():
         table = load_table(name)
         for setting in parse_settings([], table):
@@ -303,3 +303,65 @@ def test_a_stretch_is_a_data_set_of_its_own(data: Path) -> None:
     np.testing.assert_array_equal(depth, same)
     with pytest.raises(DatasetError, match="14 frames, none from 20 on"):
         Stretch(whole, 20, None, 1)
+
+
+SCORED = """
+    title: all that is scored after a run
+    settings: [backbone.simulated.scale_sigma=0.3, registration.min_pixels=50]
+    sequences: {"03": {reader: kitti, at: ["kitti_*"], arguments: {sequence: "03"}}}
+    blocks:
+      - title: t
+        columns:
+          - {name: AbsRel, measure: bonn_abs_rel, over: "03"}
+          - {name: delta, measure: bonn_delta_percent, over: "03"}
+          - {name: Acc, measure: indoor_acc_median_m, over: "03"}
+          - {name: NC, measure: indoor_nc, over: "03"}
+          - {name: Chamfer, measure: outdoor_chamfer_m, over: "03"}
+"""
+EXACT = tuple(
+    f"backbone.simulated.{name}=0"
+    for name in (
+        "smooth_sigma layer_sigma noise_smooth noise_iid edge_blur_px blob_share "
+        "pose_rotation_deg pose_translation drift_rotation_deg drift_translation"
+    ).split()
+)
+
+
+def test_depth_and_points_of_every_frame_are_scored_after_the_run(
+    data: Path, tmp_path: Path
+) -> None:
+    """Windows of exact depth and another unit each: what is left is what was joined wrongly."""
+    table = parse_table(SCORED)
+    noisy = ("backbone.simulated.noise_iid=0.1", "backbone.simulated.noise_smooth=0.05")
+    rows = [
+        Setting("exact", (*SIMULATED, *EXACT)),
+        Setting("noisy", (*SIMULATED, *EXACT, *noisy)),
+    ]
+    outcomes = Bench(table, Material(data), tmp_path).run(rows)
+    assert [found.reason for found in outcomes] == [None, None]
+    video = outcomes[0].scores["video_depth_bonn"]
+    assert video["num_frames"] == NUM_FRAMES
+    assert video["coverage"] > 0.9
+    exact, worse = (
+        [cell.value for cell in row.cells] for row in fill_grids(table, outcomes)[0].rows
+    )
+    abs_rel, delta, accuracy, normals, chamfer = (float(str(value)) for value in exact)
+    assert abs_rel < 0.01
+    assert delta > 99
+    assert accuracy < 0.05
+    assert normals > 0.7
+    assert chamfer < 1.0
+    assert float(str(worse[0])) > 5 * abs_rel
+    assert float(str(worse[2])) > accuracy
+
+
+def test_scores_that_are_kept_are_not_worked_out_again(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    work = Bench(parse_table(SCORED), Material(data), tmp_path)
+    rows = [Setting("exact", (*SIMULATED, *EXACT))]
+    first = work.run(rows)
+    monkeypatch.setattr("laser_slam.benchmarks.runner.PROTOCOLS", {})
+    assert work.run(rows) == first
+    (tmp_path / "exact" / "03" / "bench.json").write_text("{")
+    assert "it will be worked out anew" in str(work.run(rows)[0].reason)

@@ -52,8 +52,10 @@ class Material:
                 f"needs {spec.at[0]}; pass --data, or set LASER_SLAM_DATA, to the folder of it"
             )
         for place in spec.at:
-            if (self.root / place).exists():
-                return self.root / place
+            found = sorted(self.root.glob(place)) if "*" in place else [self.root / place]
+            for path in found:
+                if path.exists():
+                    return path
         raise DatasetError(f"no {' or '.join(spec.at)} in the data folder")
 
 

@@ -24,8 +24,8 @@ class SequenceSpec(_Part):
 
     Attributes:
         reader: name in ``laser_slam.datasets.DATASETS``, or ``path``: a drive along true poses.
-        at: places below the data folder where it may lie, the first that is there is taken;
-            none: it needs no data.
+        at: places below the data folder where it may lie, with ``*`` for any part of a name; the
+            first that is there is taken; none: it needs no data.
         arguments: of the reader, after the place.
         frames: first, end and step of the frames that are used, as a slice; none: all.
         settings: ``section.key=value`` that this input needs.
