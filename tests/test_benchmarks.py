@@ -115,6 +115,15 @@ def test_what_has_no_data_is_a_row_that_says_so(finished: tuple[Path, Result]) -
     assert "00, 01, 02, 05" in text  # not asked for
 
 
+def test_a_part_of_a_sequence_is_marked(finished: tuple[Path, Result]) -> None:
+    out, result = finished
+    text = (out / "kitti.md").read_text()
+    assert "| \\* | 03 | only a part is there: 14 of 801 frames |" in text
+    line = next(line for line in text.splitlines() if line.startswith("| **ours** |"))
+    assert "\\* (1 of 11) |" in line
+    assert "* (1 of 11)" in result.stdout
+
+
 def test_finished_runs_are_not_run_again(data: Path, finished: tuple[Path, Result]) -> None:
     out, first = finished
     reports = {path: path.stat().st_mtime_ns for path in out.rglob("report.json")}
@@ -214,7 +223,7 @@ def test_markdown_and_csv_say_what_is_missing_and_escape_it() -> None:
     lines = list(csv.DictReader(io.StringIO(as_csv("kitti", grids))))
     (line,) = (one for one in lines if one["column"] == "01" and one["measure"] == "ate_m"
                and one["method"] == "ours")  # fmt: skip
-    assert (line["value"], line["num"], line["missing"]) == ("", "0", "01: a | b,\nc")
+    assert (line["value"], line["num"], line["notes"]) == ("", "0", "01: a | b,\nc")
     assert ("ours", "01", "a | b,\nc") in list(list_missing(grids, outcomes))
 
 

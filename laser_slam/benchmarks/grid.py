@@ -30,6 +30,7 @@ class Cell:
         num_wanted: sequences that it should be the mean over.
         digits: after the point.
         reasons: why sequences are not in it, by name.
+        parts: which part of a sequence is in it, by name; of all others it is the whole.
     """
 
     value: float | str | None
@@ -37,20 +38,21 @@ class Cell:
     num_wanted: int = 1
     digits: int = 2
     reasons: dict[str, str] = field(default_factory=dict)
+    parts: dict[str, str] = field(default_factory=dict)
 
     @property
     def text(self) -> str:
-        """Return the number, and over how many of how many if it is not over all.
+        """Return the number, and over how many of how many if it is not over all; *: over parts.
 
-        >>> Cell(1.234, 2, 3).text
-        '1.23 (2 of 3)'
+        >>> Cell(1.234, 2, 3, parts={"03": "300 of 801 frames"}).text
+        '1.23* (2 of 3)'
         """
         if self.value is None:
             return "-"
         if isinstance(self.value, str):
             return self.value
         of = "" if self.num == self.num_wanted else f" ({self.num} of {self.num_wanted})"
-        return f"{self.value:.{self.digits}f}{of}"
+        return f"{self.value:.{self.digits}f}{'*' if self.parts else ''}{of}"
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def fill_grids(table: Table, outcomes: Sequence[Outcome]) -> list[Grid]:
 
 def _cell(column: Column, members: Sequence[str], outcomes: Sequence[Outcome | None]) -> Cell:
     measure = MEASURES[column.measure]
-    rows, reasons = [], {}
+    rows, reasons, parts = [], {}, {}
     for name, outcome in zip(members, outcomes, strict=True):
         scores: Scores = {} if outcome is None else outcome.scores
         value = look_up(scores, measure)
@@ -109,8 +111,10 @@ def _cell(column: Column, members: Sequence[str], outcomes: Sequence[Outcome | N
         else:
             found = {column.measure: value * measure.factor}
             rows.append(SequenceScores(name, found, weight(scores, measure)))
+            if outcome is not None and outcome.part is not None:
+                parts[name] = outcome.part
     mean = mean_score(rows, column.measure, is_weighted=True)
-    return Cell(mean.value, mean.num, mean.num_sequences, measure.digits, reasons)
+    return Cell(mean.value, mean.num, mean.num_sequences, measure.digits, reasons, parts)
 
 
 def _why(outcome: Outcome | None, measure: Measure) -> str:

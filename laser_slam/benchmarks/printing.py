@@ -15,7 +15,7 @@ from laser_slam.benchmarks.runner import Outcome
 
 OURS = "this run"
 NO_NUMBER = "-"
-CSV_HEADER = "table block method column measure value num num_wanted source missing".split()
+CSV_HEADER = "table block method column measure value num num_wanted source notes".split()
 
 
 def print_grids(grids: Sequence[Grid], outcomes: Sequence[Outcome], console: Console) -> None:
@@ -37,14 +37,20 @@ def print_grids(grids: Sequence[Grid], outcomes: Sequence[Outcome], console: Con
         console.print()
     missing = list(list_missing(grids, outcomes))
     if missing:
-        drawn = Drawn("method", "sequences", "why", title="Without a number", show_edge=False)
+        drawn = Drawn(
+            "method",
+            "sequences",
+            "what to know, or why there is no number",
+            title="Notes",
+            show_edge=False,
+        )
         for line in missing:
             drawn.add_row(*(Text(part) for part in line))
         console.print(drawn)
 
 
 def as_markdown(grids: Sequence[Grid], outcomes: Sequence[Outcome]) -> str:
-    """Write the blocks of a table, and why numbers are missing, as Markdown."""
+    """Write the blocks of a table, and what to know of missing ones, as Markdown."""
     parts = []
     for grid in grids:
         header = ["method", *(column.name for column in grid.columns), "source"]
@@ -59,13 +65,15 @@ def as_markdown(grids: Sequence[Grid], outcomes: Sequence[Outcome]) -> str:
         parts.append(f"{grid.title}\n\n{_markdown_table(header, rows)}")
     missing = [list(line) for line in list_missing(grids, outcomes)]
     if missing:
-        table = _markdown_table(["method", "sequences", "why there is no number"], missing)
-        parts.append(f"Without a number:\n\n{table}")
+        table = _markdown_table(
+            ["method", "sequences", "what to know, or why there is no number"], missing
+        )
+        parts.append(f"Notes:\n\n{table}")
     return "\n\n".join(parts) + "\n"
 
 
 def as_csv(name: str, grids: Sequence[Grid]) -> str:
-    """Write one line for each number, with why sequences are not in it."""
+    """Write one line for each number, with what is to know of it."""
     out = io.StringIO()
     lines = csv.writer(out, lineterminator="\n")
     lines.writerow(CSV_HEADER)
@@ -73,10 +81,11 @@ def as_csv(name: str, grids: Sequence[Grid]) -> str:
         for row in grid.rows:
             for column, cell in zip(grid.columns, row.cells, strict=True):
                 value = "" if cell.value is None else cell.value
-                missing = "; ".join(f"{name}: {why}" for name, why in cell.reasons.items())
+                told = {**cell.parts, **cell.reasons}
+                notes = "; ".join(f"{name}: {why}" for name, why in told.items())
                 place = [name, grid.title, row.name, column.name, column.measure]
                 counts = ["", ""] if row.source else [cell.num, cell.num_wanted]
-                lines.writerow([*place, value, *counts, row.source or OURS, missing])
+                lines.writerow([*place, value, *counts, row.source or OURS, notes])
     return out.getvalue()
 
 
@@ -85,6 +94,9 @@ def list_missing(
 ) -> Iterator[tuple[str, str, str]]:
     """Give method, sequences and reason of what has no number, equal reasons in one line."""
     yield from _by_reason(outcomes)
+    parts = {(one.sequence, one.part): None for one in outcomes if one.part and not one.reason}
+    for sequence, part in parts:
+        yield "*", sequence, f"only a part is there: {part}"
     failed = {(outcome.setting, outcome.sequence) for outcome in outcomes if outcome.reason}
     found: dict[tuple[str, str], dict[str, None]] = {}
     for grid in grids:
@@ -115,4 +127,8 @@ def _markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str
 
 
 def _escape(text: str) -> str:
-    return " ".join(text.replace("|", "\\|").split()) or NO_NUMBER
+    """Keep a text from being taken for Markdown; names in bold stay so."""
+    plain = text.replace("|", "\\|")
+    if not plain.startswith("**"):
+        plain = plain.replace("*", "\\*")
+    return " ".join(plain.split()) or NO_NUMBER

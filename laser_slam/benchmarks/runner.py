@@ -14,15 +14,15 @@ from laser_slam.benchmarks.measures import MEASURES, Scores
 from laser_slam.benchmarks.protocols import PROTOCOLS
 from laser_slam.benchmarks.settings import Setting
 from laser_slam.benchmarks.table import Table
-from laser_slam.bookkeeping import Progress, no_progress
+from laser_slam.bookkeeping import Progress, identify, no_progress
 from laser_slam.config import Config, assigned, load_config
 from laser_slam.datasets.base import Dataset
 from laser_slam.errors import ConfigError, LaserSlamError, RunFolderError
 from laser_slam.pipeline import Pipeline
 from laser_slam.predicting import settle
+from laser_slam.predicting.manifest import read_identity
 from laser_slam.results import read_report
 from laser_slam.store import name_differences, write_text
-from laser_slam.types import SequenceInfo
 
 logger = logging.getLogger(__name__)
 
@@ -44,12 +44,14 @@ class Outcome:
         sequence: its name in the table.
         scores: results by protocol; empty: it was not run.
         reason: why there are none; None: there are.
+        part: which part of the sequence was there; None: the whole, or nobody knows.
     """
 
     setting: str
     sequence: str
     scores: Scores = field(default_factory=dict)
     reason: str | None = None
+    part: str | None = None
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,9 @@ class _One:
 
     def outcome(self, on_progress: Progress) -> Outcome:
         try:
-            scores = self._scores(on_progress)
+            spec = self.bench.table.sequences[self.name]
+            dataset = self.bench.material.open(spec, self.config)
+            scores = self._scores(dataset, on_progress)
         except LaserSlamError as error:
             logger.warning("%s, %s: %s", self.setting.name, self.name, error)
             return Outcome(self.setting.name, self.name, reason=self._portable(str(error)))
@@ -139,7 +143,9 @@ class _One:
             logger.exception("%s, %s broke off", self.setting.name, self.name)
             reason = f"{type(error).__name__}: {' '.join(str(error).split())}"[:200]
             return Outcome(self.setting.name, self.name, reason=self._portable(reason))
-        return Outcome(self.setting.name, self.name, scores)
+        num, whole = dataset.info.num_frames, spec.num_frames
+        part = f"{num} of {whole} frames" if num and whole and num < whole else None
+        return Outcome(self.setting.name, self.name, scores, part=part)
 
     def _portable(self, text: str) -> str:
         """Name folders as anybody may, who makes the same table elsewhere."""
@@ -149,11 +155,9 @@ class _One:
                 text = text.replace(str(place), word)
         return text
 
-    def _scores(self, on_progress: Progress) -> dict[str, Any]:
-        spec = self.bench.table.sequences[self.name]
-        dataset: Dataset = self.bench.material.open(spec, self.config)
+    def _scores(self, dataset: Dataset, on_progress: Progress) -> dict[str, Any]:
         if (self.folder / "report.json").exists():
-            self._refuse_another_run(dataset.info)
+            self._refuse_another_run(dataset)
         else:
             Pipeline(dataset, self.config, self.folder, on_progress=on_progress).run()
         scores = _read_scores(self.folder / SCORES)
@@ -163,16 +167,21 @@ class _One:
             write_text(self.folder / SCORES, json.dumps(scores, indent=2) + "\n")
         return {**scores, RUN: _numbers(self.folder)}
 
-    def _refuse_another_run(self, info: SequenceInfo) -> None:
-        """Refuse a finished run whose settings are not those of the row."""
-        stored = load_config(file=self.folder / "config.yaml").model_dump(mode="json")
-        wanted = settle(self.config, info, self.folder).model_dump(mode="json")
-        differences = name_differences(stored, wanted)
-        if differences:
-            raise RunFolderError(
-                f"{self.folder} holds a run with other settings: {differences}; remove it, or "
-                "choose another folder with --out"
-            )
+    def _refuse_another_run(self, dataset: Dataset) -> None:
+        """Refuse a finished run whose settings or input are not those of the row."""
+        settings = load_config(file=self.folder / "config.yaml").model_dump(mode="json")
+        wanted = settle(self.config, dataset.info, self.folder).model_dump(mode="json")
+        pairs = {
+            "settings": (settings, wanted),
+            "input": (read_identity(self.folder), identify(dataset)),
+        }
+        for what, (stored, now) in pairs.items():
+            differences = name_differences(stored, now)
+            if differences:
+                raise RunFolderError(
+                    f"{self.folder} holds a run with other {what}: {differences}; remove it, or "
+                    "choose another folder with --out"
+                )
 
 
 def _numbers(folder: Path) -> dict[str, Any]:

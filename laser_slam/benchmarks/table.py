@@ -28,6 +28,7 @@ class SequenceSpec(_Part):
             first that is there is taken; none: it needs no data.
         arguments: of the reader, after the place.
         frames: first, end and step of the frames that are used, as a slice; none: all.
+        num_frames: that the whole has; of a part, what is measured says so; None: not known.
         settings: ``section.key=value`` that this input needs.
         note: what a reader of the table should know of it.
     """
@@ -36,6 +37,7 @@ class SequenceSpec(_Part):
     at: tuple[str, ...] = ()
     arguments: dict[str, Any] = {}
     frames: tuple[int, int | None, int] | None = None
+    num_frames: int | None = None
     settings: tuple[str, ...] = ()
     note: str = ""
 
