@@ -109,7 +109,7 @@ FAULTS: dict[str, tuple[str, Spoil, str]] = {
     "scannet: no images": (
         "scannet",
         lambda folder: shutil.rmtree(folder / "color"),
-        "no images such as 0.jpg for there is no folder .*color; give the folder of one",
+        "no folder .*color; give the folder of one exported scene",
     ),
     "scannet: an empty folder": (
         "scannet",

@@ -114,6 +114,13 @@ def test_a_data_set_is_in_the_table_and_has_a_command(key: str, root: Path) -> N
     assert "give " in line or "pass " in line
 
 
+def test_the_page_on_data_sets_has_a_row_for_each() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "datasets.md").read_text()
+    own_material = {"images", "video", "synthetic"}
+    for name in set(DATASETS) - own_material:
+        assert f"\n| `{name} " in page
+
+
 @pytest.mark.parametrize("key", ["tum-rgbd", "sintel", "waymo"])
 def test_a_run_with_a_backbone_that_knows_scores_next_to_nothing(
     key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

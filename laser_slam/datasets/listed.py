@@ -171,5 +171,6 @@ def require(files: dict[int, Path], what: str, folder: Path, advice: str) -> dic
     """
     if files:
         return files
-    state = "in" if folder.is_dir() else "for there is no folder"
-    raise DatasetError(f"no images such as {what} {state} {folder}; {advice}")
+    if not folder.is_dir():
+        raise DatasetError(f"no folder {folder}; {advice}")
+    raise DatasetError(f"no images such as {what} in {folder}; {advice}")

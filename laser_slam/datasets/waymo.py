@@ -61,8 +61,9 @@ class Waymo(ListedSequence):
 def _list_images(folder: Path, camera: int) -> dict[int, Path]:
     ending = f"_{camera}"
     paths = folder.glob(f"*{ending}.jpg") if folder.is_dir() else iter(())
-    numbers = {path.stem.removesuffix(ending): path for path in paths}
-    return {int(number): numbers[number] for number in sorted(numbers) if number.isdecimal()}
+    found = {path.stem.removesuffix(ending): path for path in paths}
+    numbers = {int(number): path for number, path in found.items() if number.isdecimal()}
+    return {number: numbers[number] for number in sorted(numbers)}
 
 
 def _depth_file(image: Path) -> Path | None:
