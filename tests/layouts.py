@@ -6,11 +6,13 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
-from corridor import SIZE, true_intrinsics, true_pose, view
+from corridor import SIZE, true_intrinsics, true_pose
+from corridor import view as render
 from image_files import write_png
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -29,6 +31,7 @@ Array = NDArray[np.float64]
 T0 = 1311868164.363181  # seconds of the epoch, as TUM's times are
 DAY, DRIVE = "2011_09_26", "2011_09_26_drive_0002_sync"
 SEGMENT = "segment-183829460855609442_430_000_450_000_with_camera_labels.tfrecord"
+view = cache(render)
 FIRST_DEPTH = 5  # KITTI: the first five images of a drive have none
 
 
