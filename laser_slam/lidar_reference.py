@@ -26,7 +26,7 @@ from laser_slam.export import write_kitti, write_tum
 from laser_slam.lidar_comparison import compare_with_run
 from laser_slam.lidar_odometry import track_scans
 from laser_slam.results import write_report
-from laser_slam.sim3 import complete_poses
+from laser_slam.sim3 import Sim3, interpolate_sim3
 from laser_slam.store import new_run_folder
 from laser_slam.types import Trajectory
 
@@ -127,13 +127,29 @@ def track_camera(velodyne: Velodyne, on_progress: Progress = no_progress) -> Tra
             poses.append(pose)
             on_progress("tracking scans", len(poses), len(frames))
     first_from_scanner = np.stack(poses)
-    if straightens:  # the pose holds at the turn's end, images are taken in its middle
-        halves = 2 * np.arange(len(frames), dtype=np.int64)
-        first_from_scanner = complete_poses(halves - 1, halves, first_from_scanner)
+    if straightens:
+        first_from_scanner = half_a_turn_before(first_from_scanner)
     cam_from_velo = velodyne.rig.cam_from_velo
     any_from_cam = first_from_scanner @ np.linalg.inv(cam_from_velo)
     world_from_cam = np.linalg.inv(any_from_cam[0]) @ any_from_cam
     return Trajectory(frames, velodyne.times_s[frames], world_from_cam)
+
+
+def half_a_turn_before(first_from_scanner: Array) -> Array:
+    """Move poses at the end of each turn of the scanner to its middle, where images are taken.
+
+    KISS-ICP takes the motion during a turn to be that between the two scans before; so the first
+    two are left as they were seen, and stay where they are.
+
+    Args:
+        first_from_scanner: (N, 4, 4) rigid, of consecutive turns.
+    """
+    out = first_from_scanner.copy()
+    steps = np.linalg.inv(first_from_scanner[:-1]) @ first_from_scanner[1:]
+    for row, step in enumerate(steps[:-1], start=2):
+        half = interpolate_sim3(Sim3(), Sim3.from_matrix(step), np.array([0.5]))[0]
+        out[row] = first_from_scanner[row] @ half.inverse().matrix()
+    return out
 
 
 def straightened(velodyne: Velodyne) -> bool:
