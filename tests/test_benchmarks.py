@@ -4,11 +4,13 @@ import csv
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+from laser_slam.backbones.simulated import SimulatedBackbone
 from laser_slam.benchmarks import (
     Bench,
     Material,
@@ -23,6 +25,7 @@ from laser_slam.benchmarks import (
     save_table,
     table_names,
 )
+from laser_slam.benchmarks.measures import MEASURES, look_up
 from laser_slam.benchmarks.printing import list_missing
 from laser_slam.benchmarks.stretch import Stretch
 from laser_slam.benchmarks.table import parse_table
@@ -34,6 +37,7 @@ from laser_slam.datasets.kitti import KittiOdometry
 from laser_slam.datasets.synthetic.drive import SyntheticDrive
 from laser_slam.datasets.synthetic.save import save_kitti_layout
 from laser_slam.errors import ConfigError, DatasetError
+from laser_slam.types import Prediction
 
 NUM_FRAMES = 14
 SIMULATED = [
@@ -374,3 +378,32 @@ def test_scores_that_are_kept_are_not_worked_out_again(
     assert work.run(rows) == first
     (tmp_path / "exact" / "03" / "bench.json").write_text("{")
     assert "it will be worked out anew" in str(work.run(rows)[0].reason)
+
+
+def test_rows_of_equal_windows_can_share_one_prediction(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+    predict = SimulatedBackbone.predict
+
+    def counted(self: SimulatedBackbone, *arguments: Any) -> Prediction:
+        asked.append(len(arguments[1]))
+        return predict(self, *arguments)
+
+    monkeypatch.setattr(SimulatedBackbone, "predict", counted)
+    work = Bench(load_table("kitti"), Material(data), tmp_path, only=("03",), is_shared=True)
+    plain = (*SIMULATED, "closures.enabled=false")
+    rows = [
+        Setting("layers", plain),
+        Setting("no layers", (*plain, "layers.enabled=never")),
+        Setting("joint", (*plain, "preset=vggt-long")),
+    ]
+    outcomes = work.run(rows)
+    assert [found.reason for found in outcomes] == [None] * 3
+    assert len(asked) == 3  # windows of 8 with 3 shared: frames 0-7, 5-12, 10-13
+    assert len(list((tmp_path / "predictions").iterdir())) == 1
+    ates = [look_up(found.scores, MEASURES["ate_m"]) for found in outcomes]
+    assert ates[0] == ates[1] != ates[2]  # layers leave poses alone, another registration does not
+    assert work.run(rows) == outcomes
+    work.run([Setting("short", (*plain, "windows.size=7"))])
+    assert len(list((tmp_path / "predictions").iterdir())) == 2

@@ -13,6 +13,7 @@ from laser_slam.benchmarks.material import Material
 from laser_slam.benchmarks.measures import MEASURES, Scores
 from laser_slam.benchmarks.protocols import PROTOCOLS
 from laser_slam.benchmarks.settings import Setting
+from laser_slam.benchmarks.sharing import predict_once, replayed, shared_folder
 from laser_slam.benchmarks.table import Table
 from laser_slam.bookkeeping import Progress, identify, no_progress
 from laser_slam.config import Config, assigned, load_config
@@ -65,6 +66,8 @@ class Bench:
         resolve: layers the user's settings between the ``section.key=value`` of the table, which
             lie below, and those of sequence and row, which lie above.
         only: names of sequences or groups; none: all.
+        is_shared: rows that cut the same windows map one prediction of them; the backbone is then
+            not asked about loops.
     """
 
     table: Table
@@ -72,6 +75,7 @@ class Bench:
     out: Path
     resolve: Callable[[Sequence[str], Sequence[str]], Config] = plain_settings
     only: tuple[str, ...] = ()
+    is_shared: bool = False
 
     def sequences(self) -> list[str]:
         """Return the names of the sequences that are run, in the table's order.
@@ -111,6 +115,7 @@ class Bench:
                 on_progress(f"bench {setting.name}", sequences.index(name), len(sequences))
                 one = _One(self, setting, name, configs[setting.name, name])
                 outcomes.append(one.outcome(on_progress))
+            on_progress(f"bench {setting.name}", len(sequences), len(sequences))
         return outcomes
 
     def _config(self, setting: Setting, name: str) -> Config:
@@ -156,10 +161,16 @@ class _One:
         return text
 
     def _scores(self, dataset: Dataset, on_progress: Progress) -> dict[str, Any]:
+        config = self.config
+        if self.bench.is_shared:
+            shared = shared_folder(config, self.bench.out, self.name)
+            config = replayed(config, shared)
         if (self.folder / "report.json").exists():
-            self._refuse_another_run(dataset)
+            self._refuse_another_run(dataset, config)
         else:
-            Pipeline(dataset, self.config, self.folder, on_progress=on_progress).run()
+            if self.bench.is_shared:
+                predict_once(dataset, self.config, shared, on_progress)
+            Pipeline(dataset, config, self.folder, on_progress=on_progress).run()
         scores = _read_scores(self.folder / SCORES)
         wanted = {MEASURES[name].protocol for name in self.bench.table.measures_of(self.name)}
         for protocol in sorted(wanted - scores.keys() - {RUN}):
@@ -167,10 +178,10 @@ class _One:
             write_text(self.folder / SCORES, json.dumps(scores, indent=2) + "\n")
         return {**scores, RUN: _numbers(self.folder)}
 
-    def _refuse_another_run(self, dataset: Dataset) -> None:
+    def _refuse_another_run(self, dataset: Dataset, config: Config) -> None:
         """Refuse a finished run whose settings or input are not those of the row."""
         settings = load_config(file=self.folder / "config.yaml").model_dump(mode="json")
-        wanted = settle(self.config, dataset.info, self.folder).model_dump(mode="json")
+        wanted = settle(config, dataset.info, self.folder).model_dump(mode="json")
         pairs = {
             "settings": (settings, wanted),
             "input": (read_identity(self.folder), identify(dataset)),

@@ -39,6 +39,14 @@ SettingOption = Annotated[
 OnlyOption = Annotated[
     str | None, typer.Option("--only", help="Sequences or groups of the table: 03,06.")
 ]
+ShareOption = Annotated[
+    bool,
+    typer.Option(
+        "--share",
+        help="Rows that cut the same windows map one prediction of them; the backbone is not "
+        "asked about loops then.",
+    ),
+]
 OutOption = Annotated[
     Path | None,
     typer.Option("--out", help="Holds all runs; goes on where it stopped. [runs/TABLE]"),
@@ -55,6 +63,7 @@ class BenchFlags:
     data: DataOption = None
     setting: SettingOption = None
     only: OnlyOption = None
+    share: ShareOption = False
     backbone: BackboneOption = None
     config: ConfigOption = None
     set: SetOption = None
@@ -82,6 +91,7 @@ class BenchFlags:
             parts += [] if value is None else [flag, value]
         for flag, values in (("--setting", self.setting), ("--set", self.set)):
             parts += [part for value in values or [] for part in (flag, value)]
+        parts += ["--share"] if self.share else []
         return shlex.join(parts) + ("" if self.data is None else " --data DATA")
 
 
@@ -112,7 +122,7 @@ def bench(
     settings = parse_settings(options.setting or [], chosen)
     out = options.out or Path("runs") / table
     only = tuple(part.strip() for part in (options.only or "").split(",") if part.strip())
-    work = Bench(chosen, Material(options.data), out, options.resolve, only)
+    work = Bench(chosen, Material(options.data), out, options.resolve, only, options.share)
     with progress_display(quiet=options.quiet) as on_progress:
         outcomes = work.run(settings, on_progress)
     print_grids(fill_grids(chosen, outcomes), outcomes, Console())
