@@ -150,37 +150,37 @@ class _DepthComparison:
         """Compare confident depth, all with one scale; None: no keyframe has a scan.
 
         Returns:
-            The scores, and metres per world unit by the median ratio of each keyframe.
+            The scores, ``median_rel`` being the middle error with the scale given; and metres per
+            world unit by the median ratio of each keyframe.
         """
         pairs = [self._pixels(view) for view in views]
         if not pairs:
             return None, np.empty(0)
         depths, truths, masks = (list(part) for part in zip(*pairs, strict=True))
         metric = [depth * np.float32(metres_per_unit) for depth in depths]
-        scales = [
-            float(np.median(truth[used] / depth[used]))
-            for depth, truth, mask in pairs
-            if (used := mask & (depth > 0)).any()
-        ]
         by_path = evaluate_depth(metric, truths, masks, "none")
+        ratios = [truth[used] / depth[used] for depth, truth, used in pairs if used.any()]
+        misfits = np.abs(metres_per_unit / np.concatenate([np.empty(0), *ratios]) - 1)
         scores = {
             "num_keyframes": len(pairs),
             "min_confidence": self._least,
+            "median_rel": float(np.median(misfits)) if len(misfits) else None,
             "by_trajectory_scale": asdict(replace(by_path, scale=metres_per_unit)),
             "by_median_ratio": asdict(evaluate_depth(depths, truths, masks)),
         }
-        return scores, np.array(scales)
+        return scores, np.array([float(np.median(ratio)) for ratio in ratios])
 
     def _pixels(
         self, view: DepthView
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-        """Take the pixels that have a laser point: depth, truth, and whether depth is sure."""
+        """Take the pixels that have a laser point: depth, truth, and where depth is sure."""
         truth = self._velodyne.depth(view.frame)
         assert truth is not None  # only frames with scans were asked for
         size = (view.depth.shape[0], view.depth.shape[1])
         truth = Rectifier(self._calibration, size).depth(truth)
         rows = np.isfinite(truth)
-        return view.depth[rows], truth[rows], view.confidence[rows] >= self._least
+        depth = view.depth[rows]
+        return depth, truth[rows], (view.confidence[rows] >= self._least) & (depth > 0)
 
 
 def _compare_cloud(

@@ -217,12 +217,13 @@ def summarize_lidar(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _summarize_depth(depth: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    for key, words in (("by_trajectory_scale", "path"), ("by_median_ratio", "depth itself")):
-        scores = depth[key]
-        if scores["abs_rel"] is not None:
-            yield (
-                "depth AbsRel",
-                f"{scores['abs_rel']:.3f} with the scale of the {words}, over the "
-                f"{scores['coverage']:.0%} of {depth['num_keyframes']} keyframes' laser points "
-                "that are confident",
-            )
+    if depth["median_rel"] is None:
+        yield "depth AbsRel", "no confident depth where laser points are"
+        return
+    scores = depth["by_trajectory_scale"]
+    yield (
+        "depth AbsRel",
+        f"{scores['abs_rel']:.3f}, median {depth['median_rel']:.3f}, with the scale of the path; "
+        f"{depth['by_median_ratio']['abs_rel']:.3f} with its own",
+    )
+    yield "", f"over the {scores['coverage']:.0%} of the laser points where depth is confident"

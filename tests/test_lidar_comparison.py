@@ -1,0 +1,163 @@
+"""Runs judged by laser scans of the corridor, where every distance is known."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from corridor import DISTANCES, NORMALS, SIZE, Corridor, TrueBackbone, true_intrinsics, true_pose
+from numpy.typing import NDArray
+from scans import beams, cam0_from_velo, write_scan
+
+import laser_slam.pipeline
+from laser_slam.config import load_config
+from laser_slam.datasets.velodyne import Rig, Velodyne
+from laser_slam.errors import DegenerateGeometryError
+from laser_slam.evaluation.clouds import ScanDistances
+from laser_slam.lidar_comparison import align_cameras, compare_with_run, stretch_scales
+from laser_slam.pipeline import Pipeline
+from laser_slam.sim3 import Sim3, rotation_exp
+from laser_slam.types import Prediction, Trajectory
+
+NUM = 24
+SCANNED = tuple(range(0, NUM, 3))
+ROUNDING = 0.02  # of depth: half a pixel of 128, on walls that are seen at a grazing angle
+CONFIG = load_config(
+    assignments=["windows.size=8", "windows.overlap=3", "windows.min_parallax_px=0.2"]
+)
+
+
+class FarSighted(TrueBackbone):
+    """A backbone that sees everything a tenth too far, and moves rightly."""
+
+    def predict(self, *arguments: Any) -> Prediction:
+        right = super().predict(*arguments)
+        return replace(right, depth=right.depth * np.float32(1.1))
+
+
+def scan(frame: int) -> NDArray[np.float64]:
+    """Return what the scanner sees of the corridor's planes."""
+    directions = beams()[::7]
+    world_from_velo = true_pose(frame) @ cam0_from_velo()
+    gap = DISTANCES - NORMALS @ world_from_velo[:3, 3]
+    with np.errstate(divide="ignore"):
+        far = gap / (directions @ world_from_velo[:3, :3].T @ NORMALS.T)
+    nearest = np.where(far > 0, far, np.inf).min(axis=1)
+    seen = nearest < 80  # the corridor is open behind
+    return np.asarray(directions[seen] * nearest[seen, None])
+
+
+@pytest.fixture(scope="module")
+def velodyne(tmp_path_factory: pytest.TempPathFactory) -> Velodyne:
+    folder = tmp_path_factory.mktemp("scans")
+    paths = {frame: folder / f"{frame:06d}.bin" for frame in SCANNED}
+    for frame, path in paths.items():
+        write_scan(path, scan(frame))
+    rig = Rig(cam0_from_velo(), true_intrinsics(), SIZE)
+    return Velodyne(paths, np.arange(NUM) / 10.0, rig, is_compensated=True)
+
+
+def true_path(frames: Iterable[int] = SCANNED) -> Trajectory:
+    rows = np.array(list(frames), np.int64)
+    return Trajectory(rows, rows / 10.0, np.stack([true_pose(int(f)) for f in rows]))
+
+
+def judge(folder: Path, backbone: TrueBackbone, velodyne: Velodyne) -> dict[str, Any]:
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("draw_findings", "stages_picture"):
+            patch.setattr(laser_slam.pipeline, name, lambda *_: None)
+        Pipeline(Corridor(NUM, with_truth=False), CONFIG, folder, backbone=backbone).run()
+    return compare_with_run(folder, true_path(), velodyne)
+
+
+@pytest.fixture(scope="module")
+def right(tmp_path_factory: pytest.TempPathFactory, velodyne: Velodyne) -> dict[str, Any]:
+    return judge(tmp_path_factory.mktemp("runs") / "right", TrueBackbone(), velodyne)
+
+
+@pytest.fixture(scope="module")
+def wrong(tmp_path_factory: pytest.TempPathFactory, velodyne: Velodyne) -> dict[str, Any]:
+    return judge(tmp_path_factory.mktemp("runs") / "wrong", FarSighted(), velodyne)
+
+
+def test_a_right_run_lies_on_its_scans(right: dict[str, Any]) -> None:
+    assert right["depth"]["by_trajectory_scale"]["abs_rel"] < ROUNDING
+    assert right["depth"]["num_keyframes"] >= 4
+    assert right["trajectory"]["ate_sim3_m"]["rmse"] < 0.02
+    cloud = right["cloud"]
+    assert cloud["num_scans"] == len(SCANNED)
+    assert cloud["num_points"] > 500
+    assert cloud["median_m"] < 0.1
+    assert cloud["within_50_cm"] > 0.95
+
+
+def test_the_metric_scale_is_the_same_by_path_and_by_depth(right: dict[str, Any]) -> None:
+    scale = right["scale"]
+    unit_m = scale["metres_per_world_unit"]
+    assert 0.5 < unit_m < 8  # what the backbone's first window draws
+    for spread in (scale["by_stretches"], scale["by_depth_of_keyframes"]):
+        assert spread["p16"] <= spread["median"] <= spread["p84"]
+        assert abs(spread["median"] / unit_m - 1) < 0.01
+
+
+def test_depth_a_tenth_too_far_shows_in_depth_cloud_and_scale(
+    right: dict[str, Any], wrong: dict[str, Any]
+) -> None:
+    scores = wrong["depth"]
+    assert 0.09 < scores["by_trajectory_scale"]["abs_rel"] < 0.11
+    assert 0.09 < scores["median_rel"] < 0.11
+    assert scores["by_median_ratio"]["abs_rel"] < ROUNDING
+    scale = wrong["scale"]
+    ratio = scale["by_depth_of_keyframes"]["median"] / scale["metres_per_world_unit"]
+    assert abs(ratio * 1.1 - 1) < 0.01
+    assert wrong["cloud"]["median_m"] > 2 * right["cloud"]["median_m"]
+
+
+def test_a_straight_path_does_not_leave_the_roll_open() -> None:
+    truth = true_path()
+    truth.world_from_cam[:, :2, 3] = 0
+    lidar_from_world = Sim3(3.0, rotation_exp(np.array([0.3, -0.2, 2.0])), np.array([1.0, 2, 3]))
+    poses = lidar_from_world.inverse().apply_poses(truth.world_from_cam)
+    found = align_cameras(replace(truth, world_from_cam=poses), truth)
+    np.testing.assert_allclose(found.matrix(), lidar_from_world.matrix(), atol=1e-9)
+    scales = stretch_scales(replace(truth, world_from_cam=poses), truth)
+    np.testing.assert_allclose(scales, 3.0)
+    assert len(scales) == len(SCANNED) - 1
+
+
+def test_paths_without_motion_have_no_scale() -> None:
+    path = true_path()
+    still = replace(path, world_from_cam=np.tile(np.eye(4), (len(SCANNED), 1, 1)))
+    with pytest.raises(DegenerateGeometryError, match=r"the scanner moved 0.00 m, need 1 m"):
+        align_cameras(path, still)
+    with pytest.raises(DegenerateGeometryError, match="the run's path stays in one place"):
+        align_cameras(still, path)
+    with pytest.raises(DegenerateGeometryError, match="1 frames in common, need 2"):
+        align_cameras(true_path([3]), path)
+
+
+def test_points_before_a_wall_are_as_far_from_it_as_they_are() -> None:
+    wall = np.stack(np.meshgrid([10.0], np.arange(-5, 5, 0.05), np.arange(-3, 3, 0.05)), -1)
+    scan = wall.reshape(-1, 3)
+    for offset, shares in ((0.05, [1, 1, 1]), (0.15, [0, 1, 1]), (0.4, [0, 0, 1])):
+        distances = ScanDistances(scan[::11] - [offset, 0, 0])
+        distances.add(np.eye(4), scan)
+        errors = distances.errors()
+        assert errors.median_m is not None
+        assert abs(errors.median_m - offset) < 0.02
+        found = np.array([errors.within_10_cm, errors.within_20_cm, errors.within_50_cm])
+        np.testing.assert_allclose(found, shares, atol=0.02)
+
+
+def test_points_outside_the_field_of_every_scan_are_not_compared() -> None:
+    scan = np.stack(np.meshgrid([10.0], np.arange(-5, 5, 0.1), np.arange(-2, 1, 0.1)), -1)
+    roof, wall, beyond = np.array([10.0, 0, 6]), np.array([10.0, 0, 0]), np.array([300.0, 0, 0])
+    distances = ScanDistances(np.stack([roof, wall, beyond]))
+    assert distances.errors().median_m is None
+    distances.add(np.eye(4), scan.reshape(-1, 3))
+    errors = distances.errors()
+    assert errors.num_points == 1
+    assert errors.coverage == pytest.approx(1 / 3)
+    assert errors.median_m == pytest.approx(0, abs=1e-9)
