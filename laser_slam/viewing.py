@@ -56,7 +56,7 @@ def live_viewer(folder: Path, config: Config) -> Viewer:
     if has_display():
         sink = WindowSink()
     else:
-        sink = FileSink(folder / RECORDING)
+        sink = FileSink(folder / RECORDING, replace=True)
         logger.info("no display: what there is to see goes to %s", folder / RECORDING)
     return BestEffortViewer(RerunViewer(sink, config.viewer, config.fusion))
 

@@ -482,7 +482,7 @@ def test_a_folder_without_a_run_is_refused_in_words(tmp_path: Path, is_run: bool
 def test_a_full_disk_ends_the_viewing_with_one_warning(caplog: pytest.LogCaptureFixture) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("the system has no /dev/full")
-    viewer = BestEffortViewer(RerunViewer(FileSink(Path("/dev/full")), SMALL, FUSION))
+    viewer = BestEffortViewer(RerunViewer(FileSink(Path("/dev/full"), replace=True), SMALL, FUSION))
     with caplog.at_level(logging.WARNING):
         for window in range(3):
             submap = submap_of(chained, window)
@@ -498,6 +498,38 @@ def test_a_recording_that_cannot_be_written_is_an_error_where_it_was_asked_for(
 ) -> None:
     with pytest.raises(RunFolderError, match=r"cannot write the recording .*No such file"):
         view_run(run, FileSink(tmp_path / "missing" / "a.rrd"))
+
+
+def test_a_file_that_is_there_is_replaced_only_by_force(run: Path, tmp_path: Path) -> None:
+    path = tmp_path / "thesis.rrd"
+    path.write_text("years")
+    arguments = ["view", str(run), "--save", str(path), "--quiet"]
+    refused = CliRunner().invoke(app, arguments)
+    assert refused.exit_code == 1
+    assert "is there already; replace it with --force" in refused.output
+    assert len(refused.output.splitlines()) == 1
+    with pytest.raises(RunFolderError, match="is there already"):
+        view_run(run, FileSink(path))
+    assert path.read_text() == "years"
+    done = CliRunner().invoke(app, [*arguments, "--force"])
+    assert done.exit_code == 0, done.output
+    assert len(places_at_the_end(read(path))) == NUM_WINDOWS
+
+
+def test_a_file_that_cannot_be_opened_stays(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "thesis.rrd"
+    path.write_text("years")
+    sink = FileSink(path, replace=True)
+
+    def refuse(_path: Path) -> None:
+        raise RuntimeError("Permission denied, path: thesis.rrd")
+
+    monkeypatch.setattr(sink.stream, "save", refuse)
+    with pytest.raises(RunFolderError, match="Permission denied"):
+        view_run(run, sink)
+    assert path.read_text() == "years"
 
 
 def test_other_failures_are_not_hidden() -> None:

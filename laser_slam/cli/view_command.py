@@ -18,6 +18,7 @@ def view(
         Path | None, typer.Option(help="Only write a recording that rerun opens: FILE.rrd.")
     ] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Show it in a browser.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file of --save.")] = False,
     port: Annotated[int, typer.Option(help="Of the page; the data use the one after it.")] = 9090,
     quiet: QuietOption = False,
 ) -> None:
@@ -32,7 +33,10 @@ def view(
     if serve:
         sink = BrowserSink(port)
     elif save is not None or not has_display():
-        sink = FileSink(save or run / RECORDING)
+        own = run / RECORDING
+        is_own = save is None or save.resolve() == own.resolve()
+        sink = FileSink(save or own, replace=force or is_own)
+        sink.refuse_existing()  # before the run is read
     else:
         sink = WindowSink()
     with progress_display(quiet=quiet) as on_progress:

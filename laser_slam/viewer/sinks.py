@@ -53,20 +53,37 @@ class FileSink:
 
     Args:
         path: of the file, ``*.rrd``, which is made when the first window comes.
+        replace: what is at ``path`` already.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, replace: bool = False) -> None:
         self.path = path
         self.stream = _new_stream()
+        self._replace = replace
+        self._is_begun = False  # what is at the path is this recording
 
     def open(self) -> None:
         """Begin the file.
 
         Raises:
-            RunFolderError: it cannot be written.
+            RunFolderError: it cannot be written, or something is there that is not to be replaced.
         """
+        self.refuse_existing()
         with self._writing():
             self.stream.save(self.path)
+            self._is_begun = True
+
+    def refuse_existing(self) -> None:
+        """Refuse to write over what nobody asked to replace.
+
+        Raises:
+            RunFolderError: something is at ``path``.
+        """
+        if not self._replace and self.path.exists():
+            raise RunFolderError(
+                f"{self.path} is there already; replace it with --force, or choose another file "
+                "with --save"
+            )
 
     def flush(self) -> None:
         """Append what was logged so far.
@@ -87,7 +104,7 @@ class FileSink:
         try:
             yield
         except (RuntimeError, OSError) as error:
-            if self.path.is_file():
+            if self._is_begun and self.path.is_file():
                 self.path.unlink()
             reason = str(error).partition(", path:")[0]
             raise RunFolderError(
