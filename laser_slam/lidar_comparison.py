@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import asdict, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ SCANS_APART_M = 0.5  # scans from nearer together say the same of the map
 MIN_PATH_M = 1.0  # a shorter path has no scale
 STRETCH_M = 1.0  # the least length over which a scale is measured
 MOST_STRETCHES = 20
+RANGES_M = (0, 10, 20, 40, 120)
 
 
 def compare_with_run(
@@ -150,8 +152,9 @@ class _DepthComparison:
         """Compare confident depth, all with one scale; None: no keyframe has a scan.
 
         Returns:
-            The scores, ``median_rel`` being the middle error with the scale given; and metres per
-            world unit by the median ratio of each keyframe.
+            The scores, ``median_rel`` being the middle error with the scale given, and
+            ``by_range`` the same for some distances; and metres per world unit by the median
+            ratio of each keyframe.
         """
         pairs = [self._pixels(view) for view in views]
         if not pairs:
@@ -161,10 +164,12 @@ class _DepthComparison:
         by_path = evaluate_depth(metric, truths, masks, "none")
         ratios = [truth[used] / depth[used] for depth, truth, used in pairs if used.any()]
         misfits = np.abs(metres_per_unit / np.concatenate([np.empty(0), *ratios]) - 1)
+        ranges_m = np.concatenate([np.empty(0), *(truth[used] for _, truth, used in pairs)])
         scores = {
             "num_keyframes": len(pairs),
             "min_confidence": self._least,
             "median_rel": float(np.median(misfits)) if len(misfits) else None,
+            "by_range": list(_by_range(misfits, ranges_m)),
             "by_trajectory_scale": asdict(replace(by_path, scale=metres_per_unit)),
             "by_median_ratio": asdict(evaluate_depth(depths, truths, masks)),
         }
@@ -181,6 +186,20 @@ class _DepthComparison:
         rows = np.isfinite(truth)
         depth = view.depth[rows]
         return depth, truth[rows], (view.confidence[rows] >= self._least) & (depth > 0)
+
+
+def _by_range(misfits: Array, ranges_m: Array) -> Iterator[dict[str, float | int]]:
+    """Give the middle relative error between one distance and the next, where there are pixels."""
+    for near_m, far_m in pairwise(RANGES_M):
+        chosen = misfits[(ranges_m >= near_m) & (ranges_m < far_m)]
+        if len(chosen):
+            median = float(np.median(chosen))
+            yield {
+                "from_m": near_m,
+                "to_m": far_m,
+                "median_rel": median,
+                "num_pixels": len(chosen),
+            }
 
 
 def _compare_cloud(

@@ -23,6 +23,8 @@ from laser_slam.errors import DatasetError, RunFolderError
 from laser_slam.evaluation import evaluate_trajectory
 from laser_slam.evaluation.trajectory import path_distances
 from laser_slam.export import write_kitti, write_tum
+from laser_slam.exporting import ExportOptions
+from laser_slam.exporting.run import open_run
 from laser_slam.lidar_comparison import compare_with_run
 from laser_slam.lidar_odometry import track_scans
 from laser_slam.results import write_report
@@ -83,6 +85,8 @@ def make_reference(
         DegenerateGeometryError: run and scans have no motion in common.
         DependencyError: KISS-ICP is not installed.
     """
+    if run is not None:
+        open_run(run, ExportOptions())  # before minutes of tracking, if it is none
     velodyne = dataset.velodyne()
     if len(velodyne.paths) < 2:
         raise DatasetError(

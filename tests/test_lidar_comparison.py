@@ -108,6 +108,9 @@ def test_depth_a_tenth_too_far_shows_in_depth_cloud_and_scale(
     scores = wrong["depth"]
     assert 0.09 < scores["by_trajectory_scale"]["abs_rel"] < 0.11
     assert 0.09 < scores["median_rel"] < 0.11
+    assert all(0.08 < band["median_rel"] < 0.12 for band in scores["by_range"])
+    num_pixels = sum(band["num_pixels"] for band in scores["by_range"])
+    assert num_pixels == scores["by_median_ratio"]["num_pixels"]
     assert scores["by_median_ratio"]["abs_rel"] < ROUNDING
     scale = wrong["scale"]
     ratio = scale["by_depth_of_keyframes"]["median"] / scale["metres_per_world_unit"]
