@@ -63,10 +63,13 @@ def write_matrix(path: Path, matrix: Array) -> None:
     np.savetxt(path, matrix, fmt="%.12g")
 
 
-def write_exr(path: Path, pixels: NDArray[np.float32]) -> None:
-    """Write one channel of float32 in blocks of 16 lines, deflated where that shrinks them."""
+def write_exr(path: Path, pixels: NDArray[np.float32], top: int = 0) -> None:
+    """Write one channel of float32 in blocks of 16 lines, deflated where that shrinks them.
+
+    The first line has number ``top``.
+    """
     height, width = pixels.shape
-    box = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    box = struct.pack("<4i", 0, top, width - 1, top + height - 1)
     attributes = {
         ("channels", "chlist"): b"Y\0" + struct.pack("<iB3xii", 2, 0, 1, 1) + b"\0",
         ("compression", "compression"): b"\3",
@@ -81,7 +84,7 @@ def write_exr(path: Path, pixels: NDArray[np.float32]) -> None:
     for (name, kind), value in attributes.items():
         data += f"{name}\0{kind}\0".encode() + struct.pack("<i", len(value)) + value
     blocks = [
-        struct.pack("<2i", row, len(packed)) + packed
+        struct.pack("<2i", top + row, len(packed)) + packed
         for row in range(0, height, 16)
         for packed in [_packed(pixels[row : row + 16].astype("<f4").tobytes())]
     ]
