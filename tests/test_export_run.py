@@ -3,6 +3,7 @@
 import gzip
 import json
 import logging
+import os
 import resource
 import shutil
 import sys
@@ -402,6 +403,28 @@ def test_each_image_names_its_camera_where_there_are_several(run: Path, tmp_path
     content = json.loads((tmp_path / "nerfstudio" / "transforms.json").read_text())
     assert [frame["fl_x"] for frame in content["frames"]] == [50, 60, 50, 60]
     assert "fl_x" not in content
+
+
+@pytest.mark.parametrize("name", ["colmap", "colmap-text"])
+def test_colmap_finds_images_whose_names_it_cannot_say(
+    run: Path, tmp_path: Path, name: str
+) -> None:
+    cameras = [Camera((40, 60), intrinsics_matrix(50, 50, 30, 20), np.zeros(4))]
+    names = ["my drive 1.jpg", "my_drive_1.jpg", "\tb.jpg", os.fsdecode(b"caf\xe9.jpg"), "Ü.jpg"]
+    shots = [Photo(name, i, 0, np.eye(4)) for i, name in enumerate(names)]
+
+    def save(folder: Path) -> None:
+        for shot in shots:
+            (folder / shot.name).write_text(str(shot.frame))
+
+    source = replace(open_run(run, ExportOptions()), photos=lambda: Photos(cameras, shots, save))
+    find_writer(name)(tmp_path / "out", source)
+    model = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse" / "0"))
+    images = tmp_path / "out" / "images"
+    found = {number: (images / one.name).read_text() for number, one in model.images.items()}
+    assert found == {1: "0", 2: "1", 3: "2", 4: "3", 5: "4"}
+    assert len(list(images.iterdir())) == len(names)
+    assert (images / "Ü.jpg").exists()
 
 
 # --- depth --------------------------------------------------------------------------------------

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from laser_slam.export.folders import atomic_folder
 from laser_slam.types import Cloud
 
 _MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4}
+_UNREADABLE = re.compile(r"[\s\ud800-\udfff]")  # its text ends a name there; or no UTF-8
 _UNKNOWN = -1.0  # COLMAP's own mark for a reprojection error that nobody computed
 
 
@@ -22,7 +25,8 @@ def export_colmap(path: Path, source: Source) -> None:
     """Write ``images/`` and the binary model ``sparse/0``: cameras, images, points.
 
     Intrinsics are those of the photos, with the first pixel's centre at 0.5. Poses and points are
-    in world units. Points are a part of the map and have no tracks.
+    in world units. Points are a part of the map and have no tracks. What COLMAP's text cannot say
+    in a name of an image, such as a space, becomes ``_``, in the name of the file too.
 
     Raises:
         RunFolderError: a file cannot be written, or photos are missing.
@@ -55,7 +59,33 @@ def _prepare(folder: Path, source: Source) -> tuple[Photos, Cloud, Path]:
     model.mkdir(parents=True)
     (folder / "images").mkdir()
     photos.save(folder / "images")
-    return photos, cloud, model
+    return _rename(photos, folder / "images"), cloud, model
+
+
+def _rename(photos: Photos, folder: Path) -> Photos:
+    """Give the files names that both kinds of a model can hold."""
+    names = _readable([photo.name for photo in photos.photos])
+    for photo, name in zip(photos.photos, names, strict=True):
+        if name != photo.name:
+            (folder / photo.name).rename(folder / name)
+    renamed = [replace(photo, name=name) for photo, name in zip(photos.photos, names, strict=True)]
+    return replace(photos, photos=renamed)
+
+
+def _readable(names: Sequence[str]) -> list[str]:
+    """Replace what COLMAP cannot read, so that no two names become one.
+
+    >>> _readable(["my drive 1.jpg", "my_drive_1.jpg", "2.jpg"])
+    ['my_drive_1_.jpg', 'my_drive_1.jpg', '2.jpg']
+    """
+    taken, out = set(names), []
+    for name in names:
+        new = _UNREADABLE.sub("_", name)
+        while new != name and new in taken:
+            new = f"{Path(new).stem}_{Path(new).suffix}"
+        taken.add(new)
+        out.append(new)
+    return out
 
 
 def _model(camera: Camera) -> tuple[str, list[float]]:
