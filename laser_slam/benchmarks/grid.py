@@ -81,12 +81,15 @@ def fill_grids(table: Table, outcomes: Sequence[Outcome]) -> list[Grid]:
     """Put outcomes into the columns of a table.
 
     A mean is over the sequences that have the number, and says over how many; each of the others
-    is in the cell's reasons.
+    is in the cell's reasons. Blocks of which no sequence was asked for are left out.
     """
     names = list(dict.fromkeys(outcome.setting for outcome in outcomes))
     by_place = {(outcome.setting, outcome.sequence): outcome for outcome in outcomes}
     grids = []
+    asked = {outcome.sequence for outcome in outcomes}
     for block in table.blocks:
+        if not asked & {name for column in block.columns for name in table.members(column)}:
+            continue
         rows = []
         for name in names:
             cells = []

@@ -21,23 +21,24 @@ HEAD = """# Results as they stand
 Written by `laser-slam bench`, each table by the command that stands in it; no number by hand.
 
 ```
-laser-slam bench TABLE --data DATA                      here, kitti, depth, pose, points, waymo, ablation
-laser-slam bench TABLE --data DATA --backbone pi3       with a network
-laser-slam bench TABLE --setting ours --setting "short=windows.size=10,windows.overlap=3" --share
+laser-slam bench TABLE --data DATA    # here, kitti, depth, pose, points, waymo, ablation
+laser-slam bench TABLE --data DATA --backbone pi3
+laser-slam bench TABLE --share --setting ours --setting short=windows.size=10,windows.overlap=3
 laser-slam bench TABLE --only 03,06 --page docs/results.md
 ```
 
 DATA holds the data sets as [datasets.md](datasets.md) describes them, each in a folder of its own
-(`kitti_odometry`, `7scenes`, `sintel`, `bonn`, `tum`, `scannet`, `nrgbd`, `waymo`, `kitti_depth`) or all in one. A row
-is a setting: its own `section.key=value` over those that all rows have. Each row of each sequence is a run with a
-folder of its own below `--out`; the same command goes on where it stopped and runs nothing twice. `--share` predicts
-windows once for all rows that cut the same; the backbone is then not asked about loops. `preset=vggt-long` in a row
-is VGGT-Long's registration and loops on the same backbone (the paper's "pi3-Long"), `preset=paper` and
-`preset=official` are the choices of the LASER paper and of its code.
+(`kitti_odometry`, `7scenes`, `sintel`, `bonn`, `tum`, `scannet`, `nrgbd`, `waymo`, `kitti_depth`)
+or all in one. A row is a setting: its own `section.key=value` over those that all rows have. Each
+row of each sequence is a run with a folder of its own below `--out`; the same command goes on where
+it stopped and runs nothing twice. `--share` predicts windows once for all rows that cut the same;
+the backbone is then not asked about loops. `preset=vggt-long` in a row is VGGT-Long's registration
+and loops on the same backbone (the paper's "pi3-Long"), `preset=paper` and `preset=official` are
+the choices of the LASER paper and of its code.
 
-Rows whose source is "this run" were run by the command, all others are as their source has published them. A mean says
-over how many sequences it is where some have no number; a number with * is over a part of a sequence. Why, stands below
-the table.
+Rows whose source is "this run" were run by the command, all others are as their source has
+published them. A mean says over how many sequences it is where some have no number; a number with *
+is over a part of a sequence. Why, stands below the table.
 """
 
 

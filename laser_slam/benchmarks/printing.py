@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 from rich.console import Console
 from rich.table import Table as Drawn
@@ -24,7 +24,7 @@ def print_grids(grids: Sequence[Grid], outcomes: Sequence[Outcome], console: Con
         drawn = Drawn(title=grid.title, title_justify="left", show_edge=False)
         drawn.add_column("method", no_wrap=True)
         for column in grid.columns:
-            drawn.add_column(column.name, justify="right")
+            drawn.add_column(column.name, justify="right", overflow="fold")
         if any(row.source for row in grid.rows):
             drawn.add_column("source", style="dim")
         num_ours = sum(row.source is None for row in grid.rows)
@@ -97,7 +97,13 @@ def list_missing(
     parts = {(one.sequence, one.part): None for one in outcomes if one.part and not one.reason}
     for sequence, part in parts:
         yield "*", sequence, f"only a part is there: {part}"
-    failed = {(outcome.setting, outcome.sequence) for outcome in outcomes if outcome.reason}
+    yield from _by_measure(grids, {(one.setting, one.sequence) for one in outcomes if one.reason})
+
+
+def _by_measure(
+    grids: Sequence[Grid], failed: Collection[tuple[str, str]]
+) -> Iterator[tuple[str, str, str]]:
+    """Give what was run and lacks a number, rows that lack the same of the same in one line."""
     found: dict[tuple[str, str], dict[str, None]] = {}
     for grid in grids:
         for row in (row for row in grid.rows if row.source is None):
@@ -106,8 +112,11 @@ def list_missing(
                     if (row.name, sequence) not in failed and why:
                         what = why if why == NOT_ASKED else f"{column.measure}: {why}"
                         found.setdefault((row.name, what), {})[sequence] = None
+    lines: dict[tuple[str, str], list[str]] = {}
     for (name, why), sequences in found.items():
-        yield name, ", ".join(sequences), why
+        lines.setdefault((", ".join(sequences), why), []).append(name)
+    for (names, why), rows in lines.items():
+        yield ", ".join(rows), names, why
 
 
 def _by_reason(outcomes: Sequence[Outcome]) -> Iterator[tuple[str, str, str]]:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from laser_slam.config import Config
 
+WIDTH = 200  # of what is printed to no terminal
+
 DataOption = Annotated[
     Path | None,
     typer.Option("--data", envvar="LASER_SLAM_DATA", help="Folder that holds the data sets."),
@@ -125,7 +127,10 @@ def bench(
     work = Bench(chosen, Material(options.data), out, options.resolve, only, options.share)
     with progress_display(quiet=options.quiet) as on_progress:
         outcomes = work.run(settings, on_progress)
-    print_grids(fill_grids(chosen, outcomes), outcomes, Console())
+    console = Console()
+    if not console.is_terminal:
+        console.width = max(console.width, WIDTH)
+    print_grids(fill_grids(chosen, outcomes), outcomes, console)
     report = Report(table, chosen, settings, outcomes, options.command(table))
     for path in save_table(out, report, options.page):
         typer.echo(path)
