@@ -288,6 +288,18 @@ def test_faulty_scans_are_one_line(tmp_path: Path, fault: str) -> None:
     assert re.search(message, lines[0]), lines[0]
 
 
+def test_a_raw_drive_with_an_empty_folder_of_scans_is_read_without_depth(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    drive = scans.write_raw(tmp_path / "drive", 3)
+    empty(drive / "velodyne_points/data")
+    dataset = KittiRaw(drive)
+    assert dataset.true_depth(0) is None
+    assert "no depth from LiDAR: no scans such as 000000.bin" in caplog.text
+    with pytest.raises(DatasetError, match=r"no scans such as 000000.bin"):
+        dataset.velodyne()
+
+
 def test_a_raw_drive_without_calibration_says_what_to_pass(tmp_path: Path) -> None:
     drive = scans.write_raw(tmp_path / "drive", 3)
     (tmp_path / "calib_cam_to_cam.txt").unlink()

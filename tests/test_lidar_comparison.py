@@ -1,5 +1,7 @@
 """Runs judged by laser scans of the corridor, where every distance is known."""
 
+import json
+import shutil
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -7,11 +9,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from corridor import DISTANCES, NORMALS, SIZE, Corridor, TrueBackbone, true_intrinsics, true_pose
+from corridor import (
+    DISTANCES,
+    NORMALS,
+    SIZE,
+    Corridor,
+    TrueBackbone,
+    true_intrinsics,
+    true_pose,
+    view,
+)
+from image_files import write_png
 from numpy.typing import NDArray
 from scans import beams, cam0_from_velo, write_scan
+from typer.testing import CliRunner
 
 import laser_slam.pipeline
+from laser_slam.backbones import BACKBONES
+from laser_slam.cli import app
 from laser_slam.config import load_config
 from laser_slam.datasets.velodyne import Rig, Velodyne
 from laser_slam.errors import DegenerateGeometryError
@@ -35,6 +50,10 @@ class FarSighted(TrueBackbone):
     def predict(self, *arguments: Any) -> Prediction:
         right = super().predict(*arguments)
         return replace(right, depth=right.depth * np.float32(1.1))
+
+
+def true_backbone(config: object) -> TrueBackbone:
+    return TrueBackbone()
 
 
 def scan(frame: int) -> NDArray[np.float64]:
@@ -116,6 +135,35 @@ def test_depth_a_tenth_too_far_shows_in_depth_cloud_and_scale(
     ratio = scale["by_depth_of_keyframes"]["median"] / scale["metres_per_world_unit"]
     assert abs(ratio * 1.1 - 1) < 0.01
     assert wrong["cloud"]["median_m"] > 2 * right["cloud"]["median_m"]
+
+
+def test_the_kitti_command_scores_depth_by_the_scans_beside_the_images(
+    velodyne: Velodyne, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "sequences/00"
+    for frame in range(NUM):
+        write_png(folder / f"image_2/{frame:06d}.png", view(frame)[0])
+    shutil.copytree(velodyne.paths[0].parent, folder / "velodyne")
+    rows = {"P2": np.c_[true_intrinsics(), np.zeros(3)], "Tr": cam0_from_velo()[:3]}
+    text = [f"{name}: {' '.join(map(str, row.ravel()))}\n" for name, row in rows.items()]
+    (folder / "calib.txt").write_text("".join(text))
+    (folder / "times.txt").write_text("".join(f"{0.1 * frame}\n" for frame in range(NUM)))
+    for name in ("draw_findings", "stages_picture"):
+        monkeypatch.setattr(laser_slam.pipeline, name, lambda *_: None)
+    monkeypatch.setitem(BACKBONES, "classical", f"{__name__}:true_backbone")
+    settings = ("windows.size=8", "windows.min_parallax_px=0.2", f"run.samples={NUM}")
+    command = ["kitti", "0", "--root", str(tmp_path), "--out", str(tmp_path / "run"), "--quiet"]
+    for setting in settings:
+        command += ["--set", setting]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 0, result.output
+    assert "depth AbsRel" in result.output
+    report = json.loads((tmp_path / "run/report.json").read_text())
+    assert report["trajectory"] is None
+    assert report["depth"]["num_keyframes"] >= 4
+    scores = report["depth"]["by_median_ratio"]
+    assert scores["abs_rel"] < ROUNDING
+    assert scores["num_pixels"] > 500
 
 
 def test_a_straight_path_does_not_leave_the_roll_open() -> None:

@@ -69,7 +69,7 @@ class KittiRaw:
             f"calib_cam_to_cam.txt, row P_rect_{camera[-2:]}",
             files=tuple(self._paths),
         )
-        self._velodyne = self.velodyne() if (folder / "velodyne_points").is_dir() else None
+        self._velodyne = self._find_velodyne()
 
     @property
     def info(self) -> SequenceInfo:
@@ -101,6 +101,16 @@ class KittiRaw:
         """
         paths = find_scans(_inner(self._folder / "velodyne_points"), len(self._paths))
         return Velodyne(paths, self._times_s, self._rig, is_compensated=False)
+
+    def _find_velodyne(self) -> Velodyne | None:
+        """Look for scans, without which a drive can be mapped as well."""
+        if not (self._folder / "velodyne_points").is_dir():
+            return None
+        try:
+            return self.velodyne()
+        except DatasetError as error:
+            logger.warning("no depth from LiDAR: %s", error)
+            return None
 
     def _read(self, index: int) -> Frame:
         return Frame(index, float(self._times_s[index]), read_image(self._paths[index]))
