@@ -153,6 +153,24 @@ def test_tum_depth_and_poses_beyond_20_ms_belong_to_no_image(tmp_path: Path) -> 
     assert TumRgbd(folder, posed_only=True).info.num_frames == NUM - 1
 
 
+def test_lines_of_tum_may_come_twice_and_in_any_order_as_its_own_tool_allows(
+    tmp_path: Path,
+) -> None:
+    folder = write_layout("tum-rgbd", tmp_path, NUM)
+    for name in ("depth", "groundtruth"):
+        lines = (folder / f"{name}.txt").read_text().splitlines()[2:]
+        (folder / f"{name}.txt").write_text("\n".join([*reversed(lines), *lines]))
+    dataset = TumRgbd(folder)
+    assert dataset.info.truth is not None
+    for frame in range(NUM):
+        np.testing.assert_allclose(
+            dataset.info.truth.world_from_cam[frame], true_pose(frame), atol=1e-7
+        )
+        depth = dataset.true_depth(frame)
+        assert depth is not None
+        np.testing.assert_allclose(np.nan_to_num(depth) * 5000, counts(frame, 5000), rtol=1e-6)
+
+
 def test_tum_knows_its_three_cameras_by_the_name_of_the_folder(tmp_path: Path) -> None:
     folder = write_layout("tum-rgbd", tmp_path, 2)
     focal = {"freiburg1_desk": 517.3, "freiburg2_xyz": 520.9, "freiburg3_office": 535.4}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -81,9 +82,9 @@ def read_shots(folder: Path) -> list[Shot]:
     """
     if not (folder / "rgb.txt").is_file():
         raise DatasetError(f"no rgb.txt in {folder}; give the folder of one sequence")
-    images = _read_list(folder / "rgb.txt")
+    images = _read_images(folder / "rgb.txt")
     times_s = np.array([time for time, _ in images])
-    depths = _read_optional_list(folder / "depth.txt", times_s)
+    depths = _read_depths(folder / "depth.txt", times_s)
     poses = _read_poses(folder / "groundtruth.txt", times_s)
     return [
         Shot(
@@ -96,38 +97,32 @@ def read_shots(folder: Path) -> list[Shot]:
     ]
 
 
-def _read_list(path: Path) -> list[tuple[float, str]]:
-    """Read lines of a time and a file."""
-    rows = read_rows(path, AGAIN)
-    times = _times(path, rows, 2)
-    return list(zip(times.tolist(), (words[1] for _, words in rows), strict=True))
+def _read_images(path: Path) -> list[tuple[float, str]]:
+    """Read lines of a time and a file, whose times must rise."""
+    rows = _read_timed(path, 2)
+    for (_, before, _), (number, time, _) in pairwise(rows):
+        if time <= before:
+            raise DatasetError(f"the times in {path} do not rise at line {number}; {AGAIN}")
+    return [(time, words[0]) for _, time, words in rows]
 
 
-def _read_optional_list(path: Path, times_s: Array) -> dict[int, str]:
-    if not path.is_file():
-        return {}
-    listed = _read_list(path)
-    partners = _partners(times_s, np.array([time for time, _ in listed]), path)
-    return {index: listed[partner][1] for index, partner in partners.items()}
+def _read_depths(path: Path, times_s: Array) -> dict[int, str]:
+    """Read the depth map of each image that has one."""
+    partners = _read_partners(path, times_s, 2)
+    return {index: words[0] for index, (_, words) in partners.items()}
 
 
 def _read_poses(path: Path, times_s: Array) -> dict[int, Array]:
     """Read ``time tx ty tz qx qy qz qw``: the camera in the world, metres."""
-    if not path.is_file():
-        return {}
-    rows = read_rows(path, AGAIN)
-    times = _times(path, rows, 8)
-    partners = _partners(times_s, times, path)
-    poses = {index: _pose(path, *rows[partner]) for index, partner in partners.items()}
+    partners = _read_partners(path, times_s, 8)
+    poses = {index: _pose(path, number, words) for index, (number, words) in partners.items()}
     return {index: pose for index, pose in poses.items() if pose is not None}
 
 
-def _times(path: Path, rows: list[tuple[int, list[str]]], columns: int) -> Array:
-    """Return the times of the rows, which must rise."""
-    if not rows:
-        raise DatasetError(f"{path} is empty; {AGAIN}")
-    times: list[float] = []
-    for number, words in rows:
+def _read_timed(path: Path, columns: int) -> list[tuple[int, float, list[str]]]:
+    """Read the line number, the time and the other words of each line."""
+    rows = []
+    for number, words in read_rows(path, AGAIN):
         try:
             time = float(words[0])
         except ValueError:
@@ -137,15 +132,28 @@ def _times(path: Path, rows: list[tuple[int, list[str]]], columns: int) -> Array
                 f"line {number} of {path} must hold a time and {columns - 1} "
                 f"value{'s' if columns > 2 else ''}; {AGAIN}"
             )
-        if times and time <= times[-1]:
-            raise DatasetError(f"the times in {path} do not rise at line {number}; {AGAIN}")
-        times.append(time)
-    return np.array(times)
+        rows.append((number, time, words[1:]))
+    if not rows:
+        raise DatasetError(f"{path} is empty; {AGAIN}")
+    return rows
+
+
+def _read_partners(path: Path, times_s: Array, columns: int) -> dict[int, tuple[int, list[str]]]:
+    """Find the line that belongs to each image; none where there is no such file.
+
+    Lines may come in any order and twice, as the benchmark's own tool allows.
+    """
+    if not path.is_file():
+        return {}
+    rows = _read_timed(path, columns)
+    others_s, first = np.unique([time for _, time, _ in rows], return_index=True)
+    found = {index: rows[first[i]] for index, i in _partners(times_s, others_s, path).items()}
+    return {index: (number, words) for index, (number, _, words) in found.items()}
 
 
 def _pose(path: Path, number: int, words: list[str]) -> Array | None:
     try:
-        values = np.array([float(word) for word in words[1:8]])
+        values = np.array([float(word) for word in words[:7]])
     except ValueError as error:
         raise DatasetError(f"line {number} of {path} holds no pose; {AGAIN}") from error
     if not (np.isfinite(values).all() and np.linalg.norm(values[3:]) > 0.5):
