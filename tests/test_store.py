@@ -21,7 +21,16 @@ from laser_slam.store import (
     save_layers,
     save_prediction,
 )
-from laser_slam.types import Image, Layers, Prediction, WindowStatus
+from laser_slam.store.keyframes import load_originals, save_originals
+from laser_slam.types import (
+    NO_DISTORTION,
+    Calibration,
+    Image,
+    Layers,
+    Prediction,
+    SequenceInfo,
+    WindowStatus,
+)
 
 HEIGHT, WIDTH = 192, 640
 
@@ -356,3 +365,12 @@ def test_two_runs_in_one_second_get_two_folders(tmp_path: Path) -> None:
         link_latest(folder)
         assert (tmp_path / "latest").resolve() == folder.resolve()
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(["latest", first.name, second.name])
+
+
+def test_images_whose_names_are_not_utf8_are_known_again(tmp_path: Path) -> None:
+    names = (b"caf\xe9 1.jpg", "é\\2.jpg".encode())
+    files = tuple(tmp_path / os.fsdecode(name) for name in names)
+    info = SequenceInfo("drive", (30, 40), None, None, "unknown", files=files)
+    calibration = Calibration(None, NO_DISTORTION, (30, 40), "none")
+    save_originals(tmp_path, info, calibration)
+    assert load_originals(tmp_path).files == files

@@ -52,8 +52,10 @@ def flush(path: Path) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all.
 
+    Names of files that are not UTF-8 are escaped as JSON does it, which gives them back.
+
     Raises:
         RunFolderError: the system could not write.
     """
     with atomic_write(path) as partial:
-        partial.write_text(text, encoding="utf-8")
+        partial.write_text(text, encoding="utf-8", errors="backslashreplace")
