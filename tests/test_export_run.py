@@ -633,6 +633,17 @@ def test_a_file_in_the_place_of_a_folder_is_refused(run: Path, tmp_path: Path) -
         export(run, "colmap", tmp_path, force=True)
 
 
+def test_the_empty_folder_that_one_is_in_becomes_the_export(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    export_run(run, ["depth-npz"], Path())
+    assert len(list(here.glob("*.npz"))) == len(load_keyframes(run).frames)
+    assert list(tmp_path.iterdir()) == [here]
+
+
 def test_an_unfinished_run_says_how_to_go_on(run: Path, tmp_path: Path) -> None:
     copy = tmp_path / "run"
     shutil.copytree(run, copy)

@@ -25,6 +25,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         RunFolderError: the system could not write, or what is at ``path`` is no export.
     """
     check_replaceable(path)
+    path = path.resolve()  # "." has no name, and nothing beside it
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     old = path.with_name(f".{path.name}.{os.getpid()}.old")
     try:
