@@ -712,6 +712,17 @@ def test_a_coordinate_system_needs_a_place(run: Path, tmp_path: Path) -> None:
         export(run, "colmap", tmp_path, georeference=tmp_path / "geo.txt")
 
 
+@pytest.mark.parametrize("name", ["las", "ply"])
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:4978"])
+def test_degrees_and_geocentric_coordinates_are_no_place_for_a_map(
+    run: Path, tmp_path: Path, name: str, crs: str
+) -> None:
+    np.savetxt(tmp_path / "geo.txt", np.eye(4))
+    with pytest.raises(ConfigError, match=rf"'{crs}' \(WGS 84\) is not projected"):
+        export(run, name, tmp_path, georeference=tmp_path / "geo.txt", crs=crs)
+    assert [path.name for path in tmp_path.iterdir()] == ["geo.txt"]
+
+
 def test_every_format_has_a_writer_that_is_there() -> None:
     for name in FORMATS:
         assert callable(find_writer(name))

@@ -9,12 +9,16 @@ from laser_slam.export.las import parse_crs
 
 
 def has_points(source: Source) -> None:
-    """Ask for a map that is not empty.
+    """Ask for a map that is not empty, and for its coordinate system where it names one.
 
     Raises:
         RunFolderError: it is empty, or its files are damaged.
+        ConfigError: the coordinate system is unknown, or not projected.
+        DependencyError: pyproj, which knows these, is not installed.
     """
-    source.some_points()
+    crs = source.some_points().crs
+    if crs is not None:
+        parse_crs(crs)
 
 
 def can_be_las(source: Source) -> None:
@@ -23,12 +27,10 @@ def can_be_las(source: Source) -> None:
     Raises:
         DependencyError: a package is not installed.
         RunFolderError: the map is empty, or its files are damaged.
-        ConfigError: the coordinate system is unknown.
+        ConfigError: the coordinate system is unknown, or not projected.
     """
     import_laspy()
-    crs = source.some_points().crs
-    if crs is not None:
-        parse_crs(crs)
+    has_points(source)
 
 
 def has_photos(source: Source) -> None:

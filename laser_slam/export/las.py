@@ -28,7 +28,7 @@ def export_las(path: Path, source: Source) -> None:
     Raises:
         RunFolderError: the map is empty, or the file cannot be written.
         DependencyError: laspy is not installed.
-        ConfigError: the coordinate system is unknown.
+        ConfigError: the coordinate system is unknown, or not projected.
     """
     _write(path, source.some_points(), compress=False)
 
@@ -39,7 +39,7 @@ def export_laz(path: Path, source: Source) -> None:
     Raises:
         RunFolderError: the map is empty, or the file cannot be written.
         DependencyError: laspy or lazrs is not installed.
-        ConfigError: the coordinate system is unknown.
+        ConfigError: the coordinate system is unknown, or not projected.
     """
     _write(path, source.some_points(), compress=True)
 
@@ -78,21 +78,27 @@ def _step(points: Points) -> float:
 
 
 def parse_crs(name: str) -> Any:
-    """Find a coordinate system.
+    """Find a projected coordinate system: one whose coordinates are lengths, as the map's are.
 
     Raises:
-        ConfigError: there is no such one.
+        ConfigError: there is no such one, or it is not projected.
         DependencyError: pyproj is not installed.
     """
     import_laspy()
     import pyproj  # noqa: PLC0415  (an extra)
 
     try:
-        return pyproj.CRS.from_user_input(name)
+        crs = pyproj.CRS.from_user_input(name)
     except pyproj.exceptions.CRSError as error:
         raise ConfigError(
             f"no coordinate system '{name}'; name one such as EPSG:32632 (UTM zone 32 north)"
         ) from error
+    if not crs.is_projected:
+        raise ConfigError(
+            f"the coordinate system '{name}' ({crs.name}) is not projected; name one whose "
+            "coordinates are lengths, such as EPSG:32632 (UTM zone 32 north)"
+        )
+    return crs
 
 
 def _record(laspy: Any, header: Any, cloud: Cloud) -> Any:
