@@ -204,6 +204,13 @@ def test_a_mean_is_over_what_has_a_number_and_says_over_how_many() -> None:
     assert row.cells[0].reasons["05"] == "not asked for"
 
 
+def test_blocks_that_nothing_was_asked_of_are_left_out() -> None:
+    table = load_table("here")
+    titles = [block.title for block in table.blocks]
+    only_raw = fill_grids(table, [outcome("kitti-raw", 1.0)])
+    assert [grid.title for grid in only_raw] == [title for title in titles if "Depth" in title]
+
+
 def test_depth_of_videos_is_averaged_by_pixels() -> None:
     table = parse_table("""
         title: two videos

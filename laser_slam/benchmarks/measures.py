@@ -45,7 +45,6 @@ MEASURES = {
     "frames": Measure("run", "frames.read", 0, 1.0, True),
     "bridged": Measure("run", "windows.num_bridged", 0),
     "frames_per_s": Measure("run", "frames_per_second", 2, 1.0, True),
-    "memory_mib": Measure("run", "peak_memory_mib", 0),
     **{
         f"{name}_{measure}": Measure(f"video_depth_{name}", path, digits, factor, is_higher_better)
         for name in ("sintel", "bonn", "kitti")

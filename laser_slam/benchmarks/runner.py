@@ -200,7 +200,7 @@ def _numbers(folder: Path) -> dict[str, Any]:
     report = dict(read_report(folder))
     windows = report.get("windows") or {}
     num_bridged = len(windows.get("bridged") or ())
-    kept = ("trajectory", "depth", "closures", "frames", "frames_per_second", "peak_memory_mib")
+    kept = ("trajectory", "depth", "closures", "frames", "frames_per_second")
     numbers = {name: report.get(name) for name in kept}
     return {**numbers, "windows": {"num": windows.get("num"), "num_bridged": num_bridged}}
 

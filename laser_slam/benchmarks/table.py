@@ -28,7 +28,7 @@ class SequenceSpec(_Part):
             first that is there is taken; none: it needs no data.
         arguments: of the reader, after the place.
         frames: first, end and step of the frames that are used, as a slice; none: all.
-        num_frames: that the whole has; of a part, what is measured says so; None: not known.
+        num_frames: that there should be; of fewer, what is measured says so; None: not known.
         settings: ``section.key=value`` that this input needs.
         note: what a reader of the table should know of it.
     """
