@@ -124,6 +124,19 @@ def test_the_real_library_without_network_is_told_in_one_line(
     assert "\n" not in str(caught.value)
 
 
+def test_a_cache_that_is_no_folder_is_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def download(repo: str, file: str, *, local_files_only: bool = False) -> str:
+        raise NotADirectoryError(errno.ENOTDIR, "Not a directory", "/dev/null/x")
+
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
+    with pytest.raises(WeightsError) as caught:
+        find_weights("", RELEASED)
+    text = str(caught.value)
+    assert f"cannot be used ([Errno {errno.ENOTDIR}] Not a directory: '/dev/null/x'): name" in text
+    assert "another folder in the environment variable HF_HOME; download model" in text
+    assert "\n" not in text
+
+
 def test_gated_weights_say_where_to_accept_their_terms(monkeypatch: pytest.MonkeyPatch) -> None:
     error = kinds.GatedRepoError("401 Client Error", response=answer(401))
     text = told(monkeypatch, error)

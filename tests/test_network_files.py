@@ -90,6 +90,10 @@ def test_bfloat16_is_near_and_its_heads_are_exact(pi3: Pi3, tmp_path: Path) -> N
         ({"register_token": None}, "1 missing (register_token)"),
         ({"register_token": torch.zeros(1, 1, 5, 63)}, "1 of another shape (register_token"),
         ({"register_token": torch.zeros(1, 1, 5, 64, dtype=torch.int64)}, "1 not floating"),
+        (
+            {"register_token": torch.zeros(1, 1, 5, 64).to(torch.float8_e4m3fn)},
+            "1 not floating (register_token torch.float8_e4m3fn)",
+        ),
         ({"another.head": torch.zeros(2)}, "1 unexpected (another.head)"),
     ],
 )
@@ -111,6 +115,14 @@ def test_a_truncated_checkpoint_is_one_line(pi3: Pi3, tmp_path: Path, name: str)
     file = write(tmp_path / name, pi3)
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
     with pytest.raises(WeightsError, match=r"cut\..* is not read"):
+        from_file(file).predict(images(), FRAMES, K)
+
+
+@pytest.mark.usefixtures("tiny_files")
+def test_a_table_whose_keys_are_no_names_is_one_line(tmp_path: Path) -> None:
+    file = tmp_path / "numbered.pt"
+    torch.save({0: torch.zeros(2)}, file)
+    with pytest.raises(WeightsError, match=r"numbered\.pt is not read.* no table of tensors"):
         from_file(file).predict(images(), FRAMES, K)
 
 

@@ -68,30 +68,28 @@ def _from_hub(checkpoint: Checkpoint) -> Path:
             f"({error}): pip install 'laser-slam[networks]'; or {checkpoint.advice} "
             "and give its path"
         ) from error
-    download = huggingface_hub.hf_hub_download
-    try:
-        return Path(download(checkpoint.repo, checkpoint.file, local_files_only=True))
-    except kinds.LocalEntryNotFoundError:
-        logger.info(
-            "downloading %s of %s (%s), once", checkpoint.file, checkpoint.repo, checkpoint.size
-        )
-    return _download(download, checkpoint, kinds)
-
-
-def _download(
-    download: Callable[[str, str], str], checkpoint: Checkpoint, kinds: ModuleType
-) -> Path:
     # The library's errors have no common root; HTTPError is that of its own HTTP library.
     names = ("HTTPError", "EntryNotFoundError", "XetDownloadError", "HFValidationError")
     known = tuple(getattr(kinds, name) for name in names if hasattr(kinds, name))
     try:
-        return Path(download(checkpoint.repo, checkpoint.file))
+        return _download(huggingface_hub.hf_hub_download, checkpoint, kinds)
     except (*known, OSError, RuntimeError) as error:
         why = _explain(error, checkpoint, kinds)
         raise WeightsError(
             f"{checkpoint.setting}: not set, and {why}; {checkpoint.advice} "
             "(with a browser, on any machine) and give its path"
         ) from error
+
+
+def _download(download: Callable[..., str], checkpoint: Checkpoint, kinds: ModuleType) -> Path:
+    """Ask the cache, then the hub."""
+    try:
+        return Path(download(checkpoint.repo, checkpoint.file, local_files_only=True))
+    except kinds.LocalEntryNotFoundError:
+        logger.info(
+            "downloading %s of %s (%s), once", checkpoint.file, checkpoint.repo, checkpoint.size
+        )
+    return Path(download(checkpoint.repo, checkpoint.file))
 
 
 def _explain(error: Exception, checkpoint: Checkpoint, kinds: ModuleType) -> str:
@@ -106,6 +104,11 @@ def _explain(error: Exception, checkpoint: Checkpoint, kinds: ModuleType) -> str
         return "the Hugging Face hub cannot be reached (no network, or HF_HUB_OFFLINE is set)"
     if isinstance(error, kinds.EntryNotFoundError):
         return f"{repo} has no {checkpoint.file} any more"
+    return _explain_plainly(error, checkpoint)
+
+
+def _explain_plainly(error: Exception, checkpoint: Checkpoint) -> str:
+    """Say what is wrong with the machine; what is not known is quoted."""
     is_full = isinstance(error, OSError) and error.errno == errno.ENOSPC
     if is_full or "No space left" in str(error):
         return (
@@ -113,4 +116,9 @@ def _explain(error: Exception, checkpoint: Checkpoint, kinds: ModuleType) -> str
             "free some, or name another folder in the environment variable HF_HOME"
         )
     first = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
+    if isinstance(error, OSError) and error.filename:
+        return (
+            f"the hub's cache cannot be used ({first}): "
+            "name another folder in the environment variable HF_HOME"
+        )
     return f"it cannot be downloaded ({first})"

@@ -17,6 +17,8 @@ from laser_slam.errors import DependencyError, WeightsError
 WRAPPERS = ("state_dict", "model")  # names under which training frameworks keep the tensors
 ROUNDING = 0.01  # of a constant in half precision, and more than that
 NUM_NAMED = 3  # keys of a kind that an error names
+# Numbers that stand for themselves; narrower ones want scales, which lie elsewhere in a file.
+FLOATING = {torch.float16, torch.bfloat16, torch.float32, torch.float64}
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,8 @@ def load_weights(
         unused: keys of the file that the network has no place for; one that ends in a dot stands
             for all that begin with it.
         constants: keys of the file, if they are there, whose values the network has built in.
-        dtype: that the weights get, one for all or by their keys; the file may hold another
-            floating one.
+        dtype: that the weights get, one for all or by their keys; the file may hold another of
+            ``FLOATING``.
 
     Raises:
         WeightsError: no such file, not readable, or of another network.
@@ -97,7 +99,7 @@ def load_weights(
 def read_tensors(
     file: Path, dtype: torch.dtype | Callable[[str], torch.dtype]
 ) -> dict[str, Tensor]:
-    """Read all tensors of a file; floating ones become ``dtype``, one by one to save memory.
+    """Read all tensors of a file; those ``FLOATING`` become ``dtype``, one by one to save memory.
 
     Nothing but tensors is ever unpickled.
     """
@@ -105,7 +107,7 @@ def read_tensors(
     pairs = _read_safetensors(file) if is_safe else _read_torch(file).items()
     return {
         key: value.to(dtype(key) if callable(dtype) else dtype)
-        if value.is_floating_point()
+        if value.dtype in FLOATING
         else value
         for key, value in pairs
     }
@@ -119,16 +121,16 @@ def find_differences(wanted: Mapping[str, Tensor], found: Mapping[str, Tensor]) 
         for key in shared
         if found[key].shape != wanted[key].shape
     ]
-    integers = [
+    others = [
         f"{key} {found[key].dtype}"
         for key in shared
-        if wanted[key].is_floating_point() and not found[key].is_floating_point()
+        if wanted[key].is_floating_point() and found[key].dtype not in FLOATING
     ]
     kinds = {
         "missing": [key for key in wanted if key not in found],
         "unexpected": [key for key in found if key not in wanted],
         "of another shape": shapes,
-        "not floating": integers,
+        "not floating": others,
     }
     return ", ".join(_name_some(keys, kind) for kind, keys in kinds.items() if keys)
 
@@ -168,7 +170,9 @@ def _read_torch(file: Path) -> dict[str, Tensor]:
     content = torch.load(file, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(file))
     while isinstance(content, dict) and (inner := _wrapped(content)) is not None:
         content = inner
-    if not isinstance(content, dict) or not all(map(torch.is_tensor, content.values())):
+    if not isinstance(content, dict) or not all(
+        isinstance(key, str) and torch.is_tensor(value) for key, value in content.items()
+    ):
         raise ValueError("it holds no table of tensors")
     return content
 
