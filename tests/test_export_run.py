@@ -668,6 +668,22 @@ def test_a_run_of_an_older_version_says_what_is_missing(
         export(copy, "nerfstudio", tmp_path)
 
 
+def test_a_run_of_an_older_version_still_gives_its_map_and_path(run: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(run, copy, ignore=shutil.ignore_patterns("tiles", "images.json"))
+    (copy / "keyframes.npz").unlink()
+    out = tmp_path / "out"
+    names = ["tum", "kitti", "ply"]
+    for path, same in zip(
+        export_run(copy, names, out), export_run(run, names, tmp_path / "new"), strict=True
+    ):
+        assert len(path.read_bytes()) == len(same.read_bytes()) > 0
+    for name in ("depth", "depth-npz", "mesh-ply"):
+        with pytest.raises(RunFolderError, match=r"no keyframes.npz: an older laser-slam made it"):
+            export_run(copy, ["tum", name], tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
 def test_missing_originals_are_named_before_anything_is_written(run: Path, tmp_path: Path) -> None:
     options = ExportOptions(photos_from=tmp_path)
     with pytest.raises(DatasetError, match=r"no original image .*shot-0.png and \d+ more; pass"):

@@ -33,6 +33,25 @@ def can_be_las(source: Source) -> None:
     has_points(source)
 
 
+def has_keyframes(source: Source) -> None:
+    """Ask for the places of the keyframes.
+
+    Raises:
+        RunFolderError: the run does not say which they are.
+    """
+    next(source.views(()), None)
+
+
+def has_surface(source: Source) -> None:
+    """Ask for what a mesh is made of: a map that is not empty, and keyframes.
+
+    Raises:
+        RunFolderError: the map is empty, or the run does not say which its keyframes are.
+    """
+    has_points(source)
+    has_keyframes(source)
+
+
 def has_photos(source: Source) -> None:
     """Ask for the images of the keyframes.
 

@@ -8,7 +8,14 @@ from pathlib import Path
 
 from laser_slam.dependencies import import_named
 from laser_slam.export.base import Source
-from laser_slam.export.checks import can_be_las, has_graph, has_photos, has_points
+from laser_slam.export.checks import (
+    can_be_las,
+    has_graph,
+    has_keyframes,
+    has_photos,
+    has_points,
+    has_surface,
+)
 
 Writer = Callable[[Path, Source], None]
 Check = Callable[[Source], None]
@@ -43,8 +50,8 @@ FORMATS = {
     "xyz.gz": Format(f"{_HERE}.clouds:export_xyz_gz", "map.xyz.gz", has_points, is_cloud=True),
     "las": Format(f"{_HERE}.las:export_las", "map.las", can_be_las, is_cloud=True),
     "laz": Format(f"{_HERE}.las:export_laz", "map.laz", can_be_las, is_cloud=True),
-    "mesh-ply": Format(f"{_HERE}.mesh:export_mesh_ply", "mesh.ply", has_points),
-    "mesh-glb": Format(f"{_HERE}.mesh:export_mesh_glb", "mesh.glb", has_points),
+    "mesh-ply": Format(f"{_HERE}.mesh:export_mesh_ply", "mesh.ply", has_surface),
+    "mesh-glb": Format(f"{_HERE}.mesh:export_mesh_glb", "mesh.glb", has_surface),
     "kitti": Format(f"{_HERE}.trajectories:export_kitti", "trajectory_kitti.txt"),
     "tum": Format(f"{_HERE}.trajectories:export_tum", "trajectory_tum.txt"),
     "euroc": Format(f"{_HERE}.trajectories:export_euroc", "trajectory_euroc.csv"),
@@ -56,8 +63,10 @@ FORMATS = {
     "nerfstudio": Format(
         f"{_HERE}.nerfstudio:export_nerfstudio", "nerfstudio", has_photos, is_folder=True
     ),
-    "depth": Format(f"{_HERE}.depth:export_depth", "depth", is_folder=True),
-    "depth-npz": Format(f"{_HERE}.depth:export_depth_npz", "depth-npz", is_folder=True),
+    "depth": Format(f"{_HERE}.depth:export_depth", "depth", has_keyframes, is_folder=True),
+    "depth-npz": Format(
+        f"{_HERE}.depth:export_depth_npz", "depth-npz", has_keyframes, is_folder=True
+    ),
 }
 
 

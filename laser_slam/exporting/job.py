@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from laser_slam.errors import ConfigError, RunFolderError
-from laser_slam.export import FORMATS, check_replaceable, find_writer
+from laser_slam.export import FORMATS, Source, check_replaceable, find_writer
 from laser_slam.exporting.options import ExportOptions
 from laser_slam.exporting.run import open_run
 
@@ -46,11 +46,7 @@ def export_run(
     _check_georeference(names, options)
     source = open_run(run, options)
     targets = _targets(run, names, out)
-    for name, target in targets.items():
-        _check_target(target, FORMATS[name].is_folder, force=options.force)
-    for check in dict.fromkeys(FORMATS[name].check for name in names):
-        if check is not None:
-            check(source)
+    _refuse_impossible(targets, source, force=options.force)
     for name, target in targets.items():
         _make_parent(target)
         writers[name](target, source)
@@ -64,6 +60,14 @@ def _targets(run: Path, names: Sequence[str], out: Path | None) -> dict[str, Pat
     elif len(names) == 1 and (FORMATS[names[0]].is_folder or not out.is_dir()):
         return {names[0]: out}
     return {name: out / FORMATS[name].target for name in names}
+
+
+def _refuse_impossible(targets: Mapping[str, Path], source: Source, *, force: bool) -> None:
+    for name, target in targets.items():
+        _check_target(target, FORMATS[name].is_folder, force=force)
+    for check in dict.fromkeys(FORMATS[name].check for name in targets):
+        if check is not None:
+            check(source)
 
 
 def _check_target(target: Path, is_folder: bool, *, force: bool) -> None:

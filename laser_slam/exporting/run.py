@@ -7,7 +7,7 @@ import math
 import zlib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from itertools import groupby
 from pathlib import Path
 
@@ -40,7 +40,7 @@ def open_run(run: Path, options: ExportOptions) -> Source:
     """
     _refuse_unfinished(run)
     config = load_config(file=run / "config.yaml", assignments=options.assignments)
-    opened = _Run(run, config, load_keyframes(run), options)
+    opened = _Run(run, config, options)
     trajectory = read_trajectory(run / "trajectory_tum.txt", None)
     projected_from_world = None
     if options.georeference is not None:
@@ -74,9 +74,13 @@ class _Run:
 
     folder: Path
     config: Config
-    keyframes: Keyframes
     options: ExportOptions
     masks: dict[int, bytes] = field(default_factory=dict)  # of keyframes: a few kB each
+
+    @cached_property
+    def keyframes(self) -> Keyframes:
+        """Read where the keyframes lie; runs of older versions do not say, and need not."""
+        return load_keyframes(self.folder)
 
     def points(self, projected_from_world: Sim3 | None) -> Points:
         """Look how large the map is."""
