@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,6 +174,7 @@ class Source:
         surfaces: the same without the pixels that the map leaves out, which are NaN.
         photos: gives the images of the keyframes.
         graph: file of the pose graph; None: the run has none.
+        made: what one writer has made and another needs too, by its name.
     """
 
     name: str
@@ -183,6 +185,7 @@ class Source:
     surfaces: Views
     photos: Callable[[], Photos]
     graph: Path | None
+    made: dict[str, Any] = field(default_factory=dict)
 
     def some_points(self) -> Points:
         """Return the map.

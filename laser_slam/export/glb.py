@@ -16,6 +16,7 @@ from laser_slam.store import atomic_write
 _FLOAT, _UNSIGNED_SHORT, _UNSIGNED_INT = 5126, 5123, 5125
 _VERTICES, _INDICES = 34962, 34963
 _LIMIT = 2**32 - 2**20  # bytes: the format counts them in 32 bits
+_Block = tuple[NDArray[Any], int, str, int]  # numbers, their type, what they form, and for what
 _GLTF_FROM_WORLD = np.array([1, -1, -1], np.float32)  # y up, z towards the viewer
 
 
@@ -38,13 +39,10 @@ def write_glb(
     Raises:
         RunFolderError: the mesh is too large for the format, or the file cannot be written.
     """
-    positions = np.ascontiguousarray(vertices * _GLTF_FROM_WORLD)
-    rgba = np.full((len(colors), 4), 65535, np.uint16)
-    rgba[:, :3] = _linear(colors)
-    arrays: list[tuple[NDArray[Any], int, str, int]] = [
-        (positions, _FLOAT, "VEC3", _VERTICES),
+    arrays: list[_Block] = [
+        (np.ascontiguousarray(vertices * _GLTF_FROM_WORLD), _FLOAT, "VEC3", _VERTICES),
         (np.ascontiguousarray(normals * _GLTF_FROM_WORLD), _FLOAT, "VEC3", _VERTICES),
-        (rgba, _UNSIGNED_SHORT, "VEC4", _VERTICES),
+        (_linear(colors), _UNSIGNED_SHORT, "VEC4", _VERTICES),
         (triangles.astype(np.uint32).ravel(), _UNSIGNED_INT, "SCALAR", _INDICES),
     ]
     num_bytes = sum(array.nbytes for array, *_ in arrays)
@@ -63,7 +61,7 @@ def write_glb(
             array.tofile(file)
 
 
-def _describe(arrays: list[tuple[NDArray[Any], int, str, int]], num_bytes: int) -> dict[str, Any]:
+def _describe(arrays: list[_Block], num_bytes: int) -> dict[str, Any]:
     views, accessors, start = [], [], 0
     for number, (array, component, kind, target) in enumerate(arrays):
         views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes})
@@ -96,8 +94,10 @@ def _corner(positions: NDArray[Any], extreme: Any) -> list[float]:
 
 
 def _linear(colors: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """Undo sRGB's gamma: (N, 3) bytes to 16 bits of light."""
+    """Undo sRGB's gamma: (N, 3) bytes to (N, 4) of 16 bits of light, opaque."""
     level = np.arange(256) / 255
     light = np.where(level <= 0.04045, level / 12.92, ((level + 0.055) / 1.055) ** 2.4)
     table = np.rint(65535 * light).astype(np.uint16)
-    return np.asarray(table[colors])
+    rgba = np.full((len(colors), 4), 65535, np.uint16)
+    rgba[:, :3] = table[colors]
+    return rgba

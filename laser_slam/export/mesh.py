@@ -55,7 +55,7 @@ def export_mesh_ply(path: Path, source: Source) -> None:
     Raises:
         RunFolderError: there is no surface, or the file cannot be written.
     """
-    mesh = build_mesh(source)
+    mesh = _the_mesh(source)
     rows = np.zeros(len(mesh.vertices), np.dtype(_PLY_VERTEX))
     names = [name for name, _ in _PLY_VERTEX]
     columns = [*mesh.vertices.T, *mesh.normals.T, *mesh.colors.T]
@@ -78,8 +78,16 @@ def export_mesh_glb(path: Path, source: Source) -> None:
     Raises:
         RunFolderError: there is no surface, it is too large, or the file cannot be written.
     """
-    mesh = build_mesh(source)
+    mesh = _the_mesh(source)
     write_glb(path, mesh.vertices, mesh.normals, mesh.colors, mesh.triangles)
+
+
+def _the_mesh(source: Source) -> Mesh:
+    """Return the mesh, which takes long and is the same for all formats."""
+    if "mesh" not in source.made:
+        source.made["mesh"] = build_mesh(source)
+    mesh: Mesh = source.made["mesh"]
+    return mesh
 
 
 def build_mesh(source: Source) -> Mesh:
