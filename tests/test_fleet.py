@@ -8,15 +8,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from laser_slam.cli import app
 from laser_slam.config import Config, load_config
 from laser_slam.datasets.synthetic.drive import SyntheticDrive
 from laser_slam.errors import ConfigError, LaserSlamError, WeightsError
 from laser_slam.predicting import Fleet, Job
 from laser_slam.predicting.cluster import divide
-from laser_slam.predicting.fleet import Crew, Worker, _cause
+from laser_slam.predicting.fleet import Crew, Worker, _cause, _Task
 from laser_slam.store import load_prediction
+from laser_slam.types import Window
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'laser-slam[ray]'")
 
@@ -174,15 +178,17 @@ def test_the_simulated_backbone_is_not_spread(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("has", "fleet", "name", "wanted"),
     [
-        ({"CPU": 64, "GPU": 8}, Fleet(), "pi3", (8, 8, 1)),
-        ({"CPU": 64, "GPU": 8}, Fleet(num_workers=3, cores=4), "vggt", (3, 4, 1)),
-        ({"CPU": 64, "GPU": 8}, Fleet(), "classical", (32, 2, 0)),
-        ({"CPU": 6}, Fleet(cores=3), "pi3", (2, 3, 0)),
-        ({"CPU": 1}, Fleet(), "classical", (1, 1, 0)),
+        ([{"CPU": 64, "GPU": 8}], Fleet(), "pi3", (8, 8, 1)),
+        ([{"CPU": 64, "GPU": 8}], Fleet(num_workers=3, cores=4), "vggt", (3, 4, 1)),
+        ([{"CPU": 64, "GPU": 8}], Fleet(), "classical", (32, 2, 0)),
+        ([{"CPU": 4}, {"CPU": 2, "GPU": 1}], Fleet(), "pi3", (1, 2, 1)),
+        ([{"CPU": 3}, {"CPU": 3}], Fleet(), "classical", (2, 2, 0)),
+        ([{"CPU": 6}], Fleet(cores=3), "pi3", (2, 3, 0)),
+        ([{"CPU": 1}], Fleet(), "classical", (1, 1, 0)),
     ],
 )
 def test_workers_fill_the_cluster(
-    has: dict[str, float], fleet: Fleet, name: str, wanted: tuple[int, int, int]
+    has: list[dict[str, float]], fleet: Fleet, name: str, wanted: tuple[int, int, int]
 ) -> None:
     config = load_config(assignments=[f"backbone.name={name}"]).backbone
     needs, num = divide(has, fleet, config)
@@ -190,8 +196,49 @@ def test_workers_fill_the_cluster(
 
 
 def test_more_workers_than_there_is_room_for_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"5 workers of 1 cores .* lower --workers or --cores"):
-        divide({"CPU": 4}, Fleet(num_workers=5, cores=1), CONFIG.backbone)
+    with pytest.raises(
+        ConfigError, match=r"5 workers of 1 cores .* room for 4 on 1 machines; lower"
+    ):
+        divide([{"CPU": 4}], Fleet(num_workers=5, cores=1), CONFIG.backbone)
+
+
+@pytest.mark.usefixtures("cluster")
+def test_a_crew_goes_on_with_those_who_are_left(
+    tmp_path: Path, alone: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where a machine is gone: nobody comes in the place of the one that is lost."""
+    give, start, killed = Crew._give, Crew._start, []
+
+    def start_no_third(crew: Crew) -> None:
+        if not killed:
+            start(crew)
+
+    def kill_the_first(crew: Crew, *arguments: Any) -> None:
+        give(crew, *arguments)
+        if not killed:
+            killed.append(crew.workers[0])
+            ray.kill(crew.workers[0])
+
+    monkeypatch.setattr(Crew, "_start", start_no_third)
+    monkeypatch.setattr(Crew, "_give", kill_the_first)
+    assert job(tmp_path / "run").run() == len(alone)
+    assert files_of(tmp_path / "run") == alone
+
+
+@pytest.mark.usefixtures("cluster")
+def test_windows_over_which_every_worker_is_lost_end_the_job() -> None:
+    with Crew(ONE, CONFIG.backbone) as crew:
+        task = _Task([Window(4, np.arange(2), ())])
+        for _ in range(2):
+            crew._let_go(None, task, RuntimeError("gone"))
+        with pytest.raises(LaserSlamError, match=r"3 workers were lost over windows 4 to 4 \(gone"):
+            crew._let_go(None, task, RuntimeError("gone"))
+
+
+def test_options_of_a_fleet_without_a_fleet_are_refused() -> None:
+    result = CliRunner().invoke(app, ["predict", "demo", "--workers", "2"])
+    assert result.exit_code == 1
+    assert "are for --engine ray" in result.stderr
 
 
 def test_a_bug_in_a_worker_is_told_in_one_line() -> None:

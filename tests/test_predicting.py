@@ -6,6 +6,7 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -27,10 +28,17 @@ from laser_slam.predicting import Job
 from laser_slam.predicting.ahead import ahead
 from laser_slam.predicting.sequence import PredictedSequence
 from laser_slam.results import Results
+from laser_slam.store import WindowFiles
 
 NUM_FRAMES = 24
 SETTINGS = ["windows.size=8", "windows.overlap=3", "windows.min_parallax_px=0.2"]
 CONFIG = load_config(assignments=SETTINGS)
+WHOLE = """backbone: x
+identity: {a: 1}
+image_size: [3, 4]
+settings: {windows: {}}
+windows: [[0]]
+"""
 MADE = ("trajectory_kitti.txt", "map.ply", "graph.g2o")
 
 
@@ -176,7 +184,7 @@ def test_another_backbone_does_not_go_on_with_the_predictions_of_one(tmp_path: P
     with pytest.raises(KeyboardInterrupt):
         Job(dataset, CONFIG, folder, backbone=TrueBackbone(interrupt_at=2)).run()
     message = refusal(Job(dataset, CONFIG, folder, backbone=Other()).run)
-    assert "another backbone: identity.corridor (1, now 2); predict anew" in message
+    assert "other means: identity.corridor (1, now 2); predict anew" in message
 
 
 def test_predictions_of_other_windows_are_refused_by_the_setting(
@@ -185,7 +193,7 @@ def test_predictions_of_other_windows_are_refused_by_the_setting(
     config = replaying(predicted, "windows.overlap=4")
     dataset = Corridor(NUM_FRAMES, unreadable=(4, 5))
     message = refusal(Pipeline, dataset, config, tmp_path / "run")
-    assert "another settings: windows.overlap (3, now 4)" in message
+    assert "other settings: windows.overlap (3, now 4)" in message
     assert f"--config {predicted / 'config.yaml'} takes theirs" in message
     assert not (tmp_path / "run").exists()
 
@@ -202,10 +210,76 @@ def test_predictions_are_not_mapped_into_their_own_folder(predicted: Path) -> No
     assert "choose another with --out" in refusal(pipeline.run)
 
 
-def test_a_lost_window_is_named(predicted: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", [None, b"cut off"])
+def test_a_lost_or_damaged_window_is_named_where_it_is_to_be_mended(
+    predicted: Path, tmp_path: Path, content: bytes | None
+) -> None:
     shutil.copytree(predicted, tmp_path / "lost")
-    (tmp_path / "lost" / "windows" / "000002.npz").unlink()
-    assert "000002.npz" in refusal(replay, tmp_path / "lost", tmp_path / "run")
+    path = tmp_path / "lost" / "windows" / "000002.npz"
+    path.unlink()
+    if content is not None:
+        path.write_bytes(content)
+    assert f"cannot read window file {path}" in refusal(replay, tmp_path / "lost", tmp_path / "run")
+
+
+def test_a_window_that_is_lost_is_predicted_again(tmp_path: Path) -> None:
+    dataset, folder = Corridor(NUM_FRAMES), tmp_path / "lost"
+    Job(dataset, CONFIG, folder, backbone=TrueBackbone()).run()
+    before = (folder / "windows" / "000001.npz").read_bytes()
+    (folder / "windows" / "000001.npz").unlink()
+    backbone = TrueBackbone()
+    Job(dataset, CONFIG, folder, backbone=backbone).run()
+    assert backbone.calls == 1
+    assert (folder / "windows" / "000001.npz").read_bytes() == before
+
+
+def test_a_replay_does_not_go_on_with_predictions_of_another_backbone(
+    predicted: Path, tmp_path: Path
+) -> None:
+    origin = tmp_path / "origin"
+    shutil.copytree(predicted, origin)
+    config = load_config(base=PredictedSequence(origin).settings)
+    replay(origin, tmp_path / "run")
+    (tmp_path / "run" / "report.json").unlink()
+    text = (origin / "predictions.yaml").read_text()
+    (origin / "predictions.yaml").write_text(text.replace("corridor: 1", "corridor: 2"))
+    message = refusal(Pipeline(PredictedSequence(origin), config, tmp_path / "run").run)
+    assert "other means: identity.corridor (1, now 2)" in message
+
+
+def test_a_replay_takes_the_size_of_windows_that_were_predicted(
+    predicted: Path, tmp_path: Path
+) -> None:
+    results = replay(predicted, tmp_path / "run", "windows.size=auto")
+    assert results.report["settings"]["windows"]["size"] == 8
+
+
+def test_a_backbone_waits_for_neither_the_use_nor_the_storing_of_its_windows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    may_store, backbone = threading.Event(), TrueBackbone()
+    save = WindowFiles.save
+
+    def wait_then_save(files: WindowFiles, *arguments: Any) -> Any:
+        assert may_store.wait(20)
+        return save(files, *arguments)
+
+    def wait_for(num_calls: int) -> None:
+        deadline = time.monotonic() + 20
+        while backbone.calls < num_calls and time.monotonic() < deadline:
+            time.sleep(0.001)
+        assert backbone.calls >= num_calls
+
+    monkeypatch.setattr(WindowFiles, "save", wait_then_save)
+    source = Job(Corridor(40), CONFIG, tmp_path / "run", backbone=backbone).source
+    source.open()
+    source.calibrate()
+    with closing(source.windows()) as windows, ThreadPoolExecutor() as pool:
+        first = pool.submit(next, windows)
+        wait_for(2)  # while the first is not stored
+        may_store.set()
+        first.result()
+        wait_for(4)  # while the first is in use
 
 
 def test_a_window_of_other_frames_is_refused(predicted: Path, tmp_path: Path) -> None:
@@ -222,6 +296,10 @@ def test_a_window_of_other_frames_is_refused(predicted: Path, tmp_path: Path) ->
         ("predictions.yaml", "a: ["),
         ("predictions.yaml", "just words"),
         ("predictions.yaml", "image_size: [3, 4]\nbackbone: x"),
+        ("predictions.yaml", WHOLE.replace("[[0]]", "3")),
+        ("predictions.yaml", WHOLE.replace("[[0]]", "[]")),
+        ("predictions.yaml", WHOLE.replace("{windows: {}}", "[1]")),
+        ("predictions.yaml", WHOLE.replace("{a: 1}", "null")),
         ("sequence.yaml", "size: 3"),
         ("sequence.yaml", ""),
         ("frames.npz", "no archive"),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from laser_slam.cli.app import HELP_NAMES, INTERRUPTED, RunOptions
+from laser_slam.errors import ConfigError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -58,12 +59,16 @@ EngineOption = Annotated[
     typer.Option("--engine", help="Who predicts: this process, or workers of Ray."),
 ]
 AddressOption = Annotated[
-    str | None, typer.Option("--address", help="Ray cluster: auto, ray://HOST:10001; else local.")
+    str | None,
+    typer.Option("--address", help="Ray cluster: auto or HOST:PORT; else this machine."),
 ]
 WorkersOption = Annotated[
-    int | None, typer.Option("--workers", min=1, help="Of Ray; default: one for each GPU.")
+    int | None,
+    typer.Option("--workers", min=1, help="Of Ray; default: as many as have room."),
 ]
-CoresOption = Annotated[int | None, typer.Option("--cores", min=1, help="Of each worker.")]
+CoresOption = Annotated[
+    int | None, typer.Option("--cores", min=1, help="Of each worker; default: of its GPU, or 2.")
+]
 
 
 @dataclass(frozen=True)
@@ -80,11 +85,18 @@ class PredictOptions(RunOptions):
         from laser_slam.console import progress_display
         from laser_slam.predicting import Fleet, Job
 
-        fleet = None
-        if self.engine == "ray":
-            fleet = Fleet(self.address, self.workers, self.cores)
+        wanted = Fleet(self.address, self.workers, self.cores)
+        if self.engine == "local" and wanted != Fleet():
+            raise ConfigError("--address, --workers and --cores are for --engine ray")
+        fleet = wanted if self.engine == "ray" else None
         with progress_display(quiet=self.quiet) as on_progress:
-            job = Job(dataset, config, self.out, fleet=fleet, on_progress=on_progress)
+            job = Job(
+                dataset,
+                config,
+                self.out,
+                fleet=fleet if self.engine == "ray" else None,
+                on_progress=on_progress,
+            )
             try:
                 num = job.run()
             except KeyboardInterrupt as error:

@@ -89,8 +89,10 @@ class BackboneSource:
             logger.info("resuming the run in %s", self._folder)
         stored = load_manifest(self._folder)
         if stored is not None:
-            refuse_others(self._folder, stored.made_by, self._manifest.made_by, "backbone")
-            self._stored = stored.windows
+            refuse_others(self._folder, stored.made_by, self._manifest.made_by, "means")
+            windows = stored.windows or []
+            if windows and all(self.files.has(index) for index in range(len(windows))):
+                self._stored = windows
         else:
             self._manifest.save(self._folder)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import socket
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,9 +21,10 @@ class Fleet:
     """Which workers there are to be.
 
     Attributes:
-        address: of a Ray cluster, such as ``auto`` or ``ray://head:10001``; None: this machine.
+        address: of a Ray cluster that this machine is part of, ``auto`` or its ``HOST:PORT``;
+            None: this machine alone.
         num_workers: None: one for each GPU, or as many as the cores allow.
-            cores: that each worker gets; None: all that there are for each GPU, without GPUs 2.
+        cores: that each worker gets; None: all that there are for each GPU; without GPUs, 2.
     """
 
     address: str | None = None
@@ -36,7 +38,7 @@ def connect(ray: Any, address: str | None) -> None:
     quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
     try:
         if address is None:
-            ray.init(include_dashboard=False, **quiet)
+            ray.init(address="local", include_dashboard=False, **quiet)
         else:
             ray.init(address=address, **quiet)
     except (ConnectionError, ValueError, RuntimeError) as error:
@@ -49,7 +51,7 @@ def connect(ray: Any, address: str | None) -> None:
 
 def _refuse_unreachable(address: str | None) -> None:
     """Say at once what Ray finds out after many minutes."""
-    host, _, port = (address or "").removeprefix("ray://").rpartition(":")
+    host, _, port = (address or "").rpartition(":")
     if not port.isdecimal():
         return
     try:
@@ -62,22 +64,34 @@ def _refuse_unreachable(address: str | None) -> None:
 
 
 def divide(
-    has: dict[str, float], fleet: Fleet, config: BackboneConfig
+    nodes: Sequence[Mapping[str, float]], fleet: Fleet, config: BackboneConfig
 ) -> tuple[dict[str, float], int]:
-    """Return what Ray is asked for each worker, and how many there are to be."""
-    cores, gpus = int(has.get("CPU", 1)), int(has.get("GPU", 0))
-    if gpus and not is_on_cpu(config):
-        needs = {"num_gpus": 1, "num_cpus": fleet.cores or max(1, cores // gpus)}
-        num = fleet.num_workers or gpus
+    """Return what Ray is asked for each worker, and how many there are to be.
+
+    Args:
+        nodes: what each machine has, as Ray calls it: CPU, GPU.
+        fleet: which workers are wanted.
+        config: of the backbone.
+
+    Raises:
+        ConfigError: more are wanted than the machines have room for.
+    """
+    room = [(int(node.get("CPU", 0)), int(node.get("GPU", 0))) for node in nodes]
+    with_gpu = [(cores, gpus) for cores, gpus in room if gpus]
+    if with_gpu and not is_on_cpu(config):
+        each = fleet.cores or max(1, min(cores // gpus for cores, gpus in with_gpu))
+        most = sum(min(gpus, cores // each) for cores, gpus in with_gpu)
+        needs: dict[str, float] = {"num_gpus": 1, "num_cpus": each}
     else:
-        needs = {"num_gpus": 0, "num_cpus": min(fleet.cores or CORES, cores)}
-        num = fleet.num_workers or max(1, cores // int(needs["num_cpus"]))
-    if num * needs["num_cpus"] > cores or num * needs["num_gpus"] > gpus:
+        each = fleet.cores or min(CORES, max((cores for cores, _ in room), default=1))
+        most = sum(cores // each for cores, _ in room)
+        needs = {"num_gpus": 0, "num_cpus": each}
+    if not 1 <= (fleet.num_workers or most) <= most:
         raise ConfigError(
-            f"{num} workers of {needs['num_cpus']} cores and {needs['num_gpus']} GPUs; there are "
-            f"{cores} cores and {gpus} GPUs: lower --workers or --cores"
+            f"{fleet.num_workers or 1} workers of {each} cores and {needs['num_gpus']} GPUs: there "
+            f"is room for {most} on {len(room)} machines; lower --workers or --cores"
         )
-    return {**needs, "max_restarts": 0}, num
+    return {**needs, "max_restarts": 0}, fleet.num_workers or most
 
 
 def last_line(error: Exception) -> str:

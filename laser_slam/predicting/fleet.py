@@ -29,7 +29,8 @@ from laser_slam.types import Window
 # stretch, whoever does it, so that the outcome does not depend on how many workers there are.
 STRETCH = 8
 MAX_TRIES = 3  # workers that may be lost over the same windows
-START_S = 600.0  # a worker may read gigabytes of weights
+START_S = 600.0  # a worker may have to fetch gigabytes of weights
+LATE_S = 60.0  # that those who came wait for the rest, who may come later still
 QUEUED = 2  # stretches per worker, so that none waits for the next
 logger = logging.getLogger(__name__)
 
@@ -83,7 +84,7 @@ class Crew:
     """
 
     def __init__(self, fleet: Fleet, config: BackboneConfig) -> None:
-        """Start the workers, in Ray if it runs in this process already.
+        """Prepare; workers start where the crew is entered, in Ray if it runs here already.
 
         Args:
             fleet: which.
@@ -91,24 +92,29 @@ class Crew:
 
         Raises:
             DependencyError: Ray is not installed.
-            ConfigError: there is no such cluster, or it has not what the workers need.
         """
         self._ray = import_ray()
+        self._fleet = fleet
         self._config = config
-        self.identity: dict[str, Any] = {}
+        self._options: dict[str, float] = {}
         self._is_guest = self._ray.is_initialized()
         self._tasks: dict[Any, tuple[Any, _Task]] = {}  # what comes of it -> worker, task
+        self._coming: dict[Any, Any] = {}  # what it will say of itself -> worker
+        self.identity: dict[str, Any] = {}
         self.workers: list[Any] = []
-        if not self._is_guest:
-            connect(self._ray, fleet.address)
-        self._options, num = divide(self._ray.cluster_resources(), fleet, config)
-        self.workers += [self._start() for _ in range(num)]
 
     def __enter__(self) -> Crew:
-        """Wait for the workers; those that would predict otherwise are refused."""
+        """Start the workers and wait for them; those that would predict otherwise are refused."""
+        if not self._is_guest:
+            connect(self._ray, self._fleet.address)
         try:
-            for worker in self.workers:
-                self._check(worker)
+            nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+            self._options, num = divide(nodes, self._fleet, self._config)
+            for _ in range(num):
+                self._start()
+            self._await_one()
+            while self._coming and self._admit(LATE_S):
+                pass
         except BaseException:
             self.__exit__()
             raise
@@ -116,7 +122,7 @@ class Crew:
 
     def __exit__(self, *_: object) -> None:
         """Let all workers go."""
-        for worker in self.workers:
+        for worker in [*self.workers, *self._coming.values()]:
             self._ray.kill(worker)
         if not self._is_guest:
             self._ray.shutdown()
@@ -126,7 +132,7 @@ class Crew:
     ) -> Iterator[tuple[list[Window], list[bytes]]]:
         """Give windows with their files' contents, in the order in which they are done.
 
-        What a lost worker had is given to another, which takes its place.
+        What a lost worker had is given to others; where there is room, another takes its place.
 
         Args:
             stretches: windows in a row; a few more are taken than there are workers.
@@ -142,16 +148,38 @@ class Crew:
         while self._tasks:
             yield from self._collect(intrinsics)
 
-    def _start(self) -> Any:
-        return self._ray.remote(Worker).options(**self._options).remote(self._config)
+    def _start(self) -> None:
+        worker = self._ray.remote(Worker).options(**self._options).remote(self._config)
+        self._coming[worker.identity.remote()] = worker
 
-    def _check(self, worker: Any) -> None:
-        """Wait for a worker, and refuse one that would predict otherwise than the others."""
+    def _await_one(self) -> None:
+        """Wait until there is a worker."""
+        while not self.workers:
+            if not self._coming or not self._admit(START_S):
+                raise LaserSlamError(
+                    f"no worker came in {START_S:.0f} s; see Ray's log, and whether any machine "
+                    f"has {self._options}; what is predicted is kept"
+                )
+
+    def _admit(self, timeout_s: float) -> bool:
+        """Wait for one of those that come; False: none came in time."""
+        done, _ = self._ray.wait(list(self._coming), num_returns=1, timeout=timeout_s)
+        for said in done:
+            self._welcome(said)
+        return bool(done)
+
+    def _welcome(self, said: Any) -> None:
+        """Take a worker on, and refuse one that would predict otherwise than the others."""
+        worker = self._coming.pop(said)
         try:
-            found = self._ray.get(worker.identity.remote(), timeout=START_S)
+            found = self._ray.get(said)
+        except self._lost() as error:
+            logger.warning("a worker did not start: %s", last_line(error))
+            return
         except self._ray.exceptions.RayError as error:
             raise _cause(error) from error
         self.identity = self.identity or found
+        self.workers.append(worker)
         if found != self.identity:
             raise ConfigError(
                 f"a worker has another backbone than the others: "
@@ -159,7 +187,13 @@ class Crew:
                 "and the same kind of device, or set dtype"
             )
 
+    def _lost(self) -> tuple[type[Exception], ...]:
+        """Return what is raised of a worker whose process or machine is gone."""
+        errors = self._ray.exceptions
+        return errors.RayActorError, errors.OutOfMemoryError, errors.NodeDiedError
+
     def _give(self, task: _Task, intrinsics: NDArray[np.float64] | None) -> None:
+        self._await_one()
         load = {id(worker): 0 for worker in self.workers}
         for worker, _ in self._tasks.values():
             load[id(worker)] = load.get(id(worker), 0) + 1
@@ -169,21 +203,25 @@ class Crew:
     def _collect(
         self, intrinsics: NDArray[np.float64] | None
     ) -> Iterator[tuple[list[Window], list[bytes]]]:
-        """Wait until something is done, or lost."""
-        done, _ = self._ray.wait(list(self._tasks), num_returns=1)
+        """Wait until something is done, or lost, or a worker comes."""
+        done, _ = self._ray.wait([*self._tasks, *self._coming], num_returns=1)
         for each in done:
+            if each in self._coming:
+                self._welcome(each)
+                continue
             worker, task = self._tasks.pop(each)
             try:
                 files = self._ray.get(each)
-            except self._ray.exceptions.ActorDiedError as error:
-                self._replace(worker, task, error)
+            except self._lost() as error:
+                self._let_go(worker, task, error)
                 self._give(task, intrinsics)
             except self._ray.exceptions.RayError as error:
                 raise _cause(error) from error
             else:
                 yield task.windows, files
 
-    def _replace(self, lost: Any, task: _Task, error: Exception) -> None:
+    def _let_go(self, worker: Any, task: _Task, error: Exception) -> None:
+        """Do without a worker; ask for another, who comes if there is room."""
         task.num_tries += 1
         first, last = task.windows[0].index, task.windows[-1].index
         if task.num_tries == MAX_TRIES:
@@ -192,10 +230,10 @@ class Crew:
                 f"({last_line(error)}); see Ray's log; give each more memory, or lower windows.size"
             ) from error
         logger.warning("a worker was lost; windows %d to %d are done again", first, last)
-        if lost in self.workers:
-            self.workers.remove(lost)
-            self.workers.append(self._start())
-            self._check(self.workers[-1])
+        if worker in self.workers:
+            self.workers.remove(worker)
+            self._ray.kill(worker)
+            self._start()
 
 
 def spread(source: BackboneSource, crew: Crew) -> Iterator[list[Window]]:

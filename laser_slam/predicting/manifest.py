@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from pydantic import Field, TypeAdapter
 
 from laser_slam.config import Config
 from laser_slam.errors import ConfigError, RunFolderError
@@ -18,6 +19,9 @@ from laser_slam.store import atomic_write, name_differences, write_text
 FILE = "predictions.yaml"
 FRAMES_FILE = "frames.npz"
 SECTIONS = ("dataset", "windows", "calibration")  # of the settings: all that decide the windows
+
+
+_Windows = Annotated[list[Annotated[list[int], Field(min_length=1)]], Field(min_length=1)]
 
 
 @dataclass(frozen=True)
@@ -35,8 +39,8 @@ class Manifest:
     backbone: str
     identity: dict[str, Any]
     image_size: tuple[int, int]
-    settings: dict[str, Any]
-    windows: list[list[int]] | None = None
+    settings: dict[str, dict[str, Any]]
+    windows: _Windows | None = None
 
     @property
     def made_by(self) -> dict[str, Any]:
@@ -58,7 +62,7 @@ class Manifest:
         write_text(folder / FILE, yaml.safe_dump(content, sort_keys=False, width=1000))
 
 
-def settings_that_matter(config: Config) -> dict[str, Any]:
+def settings_that_matter(config: Config) -> dict[str, dict[str, Any]]:
     """Return the sections of the settings that decide which frames make which window."""
     return {name: getattr(config, name).model_dump(mode="json") for name in SECTIONS}
 
@@ -72,11 +76,10 @@ def load_manifest(folder: Path) -> Manifest | None:
     path = folder / FILE
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        height, width = content.pop("image_size")
-        return Manifest(image_size=(int(height), int(width)), **content)
+        return TypeAdapter(Manifest).validate_python(content)
     except (FileNotFoundError, NotADirectoryError):
         return None
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise RunFolderError(f"{path} is damaged; predict into another folder") from error
 
 
@@ -98,7 +101,8 @@ def load_predictions(folder: str) -> Manifest:
         )
     if found.windows is None:
         raise RunFolderError(
-            f"{folder} does not hold all predictions; go on with 'laser-slam predict' there"
+            f"{folder} does not hold all predictions; the command that began it, with "
+            f"--out {folder}, goes on"
         )
     return found
 
@@ -112,7 +116,7 @@ def refuse_others(
         folder: of the predictions.
         stored: what they were made with.
         wanted: what is asked for.
-        what: 'settings', 'input' or 'backbone', for the error.
+        what: that differs, in the plural, for the error: 'settings', 'images', 'means'.
 
     Raises:
         RunFolderError: names what differs.
@@ -121,7 +125,7 @@ def refuse_others(
     if differences:
         advice = f"--config {folder / 'config.yaml'} takes theirs" if what == "settings" else ""
         raise RunFolderError(
-            f"the predictions in {folder} were made with another {what}: {differences}; "
+            f"the predictions in {folder} were made with other {what}: {differences}; "
             f"{advice or 'predict anew, into another folder'}"
         )
 

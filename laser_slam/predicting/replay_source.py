@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Generator
+from contextlib import closing
 from pathlib import Path
 
 from laser_slam.bookkeeping import FrameLog, StageClock, identify
@@ -12,6 +13,7 @@ from laser_slam.datasets.base import Dataset
 from laser_slam.errors import RunFolderError
 from laser_slam.predicting.manifest import (
     load_frames,
+    load_manifest,
     load_predictions,
     read_identity,
     refuse_others,
@@ -71,9 +73,12 @@ class ReplaySource:
         dataset = self._dataset
         known = dataset.identity if isinstance(dataset, PredictedSequence) else None
         sequence = known or identify(dataset)
-        refuse_others(self._origin, read_identity(self._origin), sequence, "input")
+        refuse_others(self._origin, read_identity(self._origin), sequence, "images")
         if open_run_folder(self._folder, self._config, sequence):
             logger.info("resuming the run in %s", self._folder)
+        stored = load_manifest(self._folder)
+        if stored is not None:
+            refuse_others(self._folder, stored.made_by, self._manifest.made_by, "means")
 
     def calibrate(self) -> None:
         """Keep the calibration with which the windows were predicted."""
@@ -83,8 +88,10 @@ class ReplaySource:
 
     def windows(self) -> Generator[tuple[Prediction, Image], None, None]:
         """Read the windows, whose files become the run's own."""
-        windows, origin = self._manifest.windows or [], WindowFiles(self._origin)
-        for index in range(len(windows)):
-            if not self._files.has(index):
-                self._files.adopt(index, origin)
-        yield from load_windows(self._files, windows, self._clock)
+        origin = WindowFiles(self._origin)
+        loaded = load_windows(origin, self._manifest.windows or [], self._clock)
+        with closing(loaded) as windows:
+            for index, window in enumerate(windows):
+                if not self._files.has(index):
+                    self._files.adopt(index, origin)
+                yield window

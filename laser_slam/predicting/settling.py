@@ -36,6 +36,10 @@ def settle(config: Config, info: SequenceInfo, folder: Path | None) -> Config:
 
 def _with_origin(config: Config) -> Config:
     manifest = load_predictions(config.backbone.replay.folder)
+    if not config.windows.size:
+        size = manifest.settings["windows"]["size"]
+        windows = config.windows.model_copy(update={"size": size})
+        config = config.model_copy(update={"windows": windows})
     replay = config.backbone.replay.model_copy(update={"made_by": manifest.backbone})
     backbone = config.backbone.model_copy(update={"replay": replay})
     return config.model_copy(update={"backbone": backbone})

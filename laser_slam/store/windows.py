@@ -130,9 +130,11 @@ class WindowFiles:
         """Take a window's file from another folder: by a link where that can be, else a copy.
 
         Raises:
-            RunFolderError: the system could not write.
+            RunFolderError: there is no such file, or the system could not write.
         """
         ours, theirs = self._path("windows", index), other._path("windows", index)
+        if not theirs.exists():
+            raise RunFolderError(f"no window file {theirs}: predict it again")
         with atomic_write(ours) as partial:
             try:
                 os.link(theirs, partial)
