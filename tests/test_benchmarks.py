@@ -211,6 +211,16 @@ def test_blocks_that_nothing_was_asked_of_are_left_out() -> None:
     assert [grid.title for grid in only_raw] == [title for title in titles if "Depth" in title]
 
 
+def test_a_sequence_may_have_a_line_of_its_own_for_each_row() -> None:
+    table = load_table("here")
+    outcomes = [outcome("drive", 1.0), Outcome("other", "drive", reason="broken")]
+    paths = fill_grids(table, outcomes)[0]
+    assert [row.name for row in paths.rows] == ["drive, ours", "drive, other"]
+    assert [row.cells[2].text for row in paths.rows] == ["1.000", "-"]
+    assert ("other", "drive", "broken") in list(list_missing([paths], outcomes))
+    assert [row.name for row in fill_grids(table, outcomes[:1])[0].rows] == ["drive"]
+
+
 def test_depth_of_videos_is_averaged_by_pixels() -> None:
     table = parse_table("""
         title: two videos

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from laser_slam.benchmarks.measures import (
@@ -61,11 +61,13 @@ class Row:
 
     Attributes:
         source: who has published it; None: it was run.
+        setting: that was run.
     """
 
     name: str
     cells: tuple[Cell, ...]
     source: str | None = None
+    setting: str = ""
 
 
 @dataclass(frozen=True)
@@ -85,21 +87,33 @@ def fill_grids(table: Table, outcomes: Sequence[Outcome]) -> list[Grid]:
     """
     names = list(dict.fromkeys(outcome.setting for outcome in outcomes))
     by_place = {(outcome.setting, outcome.sequence): outcome for outcome in outcomes}
-    grids = []
     asked = {outcome.sequence for outcome in outcomes}
+    grids = []
     for block in table.blocks:
-        if not asked & {name for column in block.columns for name in table.members(column)}:
+        if not asked & {name for column in block.all_columns for name in table.members(column)}:
             continue
         rows = []
-        for name in names:
+        for label, name, columns in _lines(block, names, asked):
             cells = []
-            for column in block.columns:
+            for column in columns:
                 members = table.members(column)
                 found = [by_place.get((name, sequence)) for sequence in members]
                 cells.append(_cell(column, members, found))
-            rows.append(Row(name, tuple(cells)))
+            rows.append(Row(label, tuple(cells), setting=name))
         grids.append(Grid(block.title, block.columns, (*rows, *_published(block))))
     return grids
+
+
+def _lines(
+    block: Block, names: Sequence[str], asked: Collection[str]
+) -> Iterator[tuple[str, str, tuple[Column, ...]]]:
+    """Give label, setting and columns of each line that was run."""
+    if not block.each:
+        yield from ((name, name, block.columns) for name in names)
+    for sequence in (sequence for sequence in block.each if sequence in asked):
+        for name in names:
+            label = sequence if len(names) == 1 else f"{sequence}, {name}"
+            yield label, name, block.columns_of(sequence)
 
 
 def _cell(column: Column, members: Sequence[str], outcomes: Sequence[Outcome | None]) -> Cell:

@@ -109,9 +109,9 @@ def _by_measure(
         for row in (row for row in grid.rows if row.source is None):
             for column, cell in zip(grid.columns, row.cells, strict=True):
                 for sequence, why in cell.reasons.items():
-                    if (row.name, sequence) not in failed and why:
+                    if (row.setting, sequence) not in failed and why:
                         what = why if why == NOT_ASKED else f"{column.measure}: {why}"
-                        found.setdefault((row.name, what), {})[sequence] = None
+                        found.setdefault((row.setting, what), {})[sequence] = None
     lines: dict[tuple[str, str], list[str]] = {}
     for (name, why), sequences in found.items():
         lines.setdefault((", ".join(sequences), why), []).append(name)

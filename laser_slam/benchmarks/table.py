@@ -47,12 +47,12 @@ class Column(_Part):
 
     Attributes:
         measure: name in ``laser_slam.benchmarks.measures.MEASURES``.
-        over: a sequence, or a group of them.
+        over: a sequence or a group of them; none: see ``Block.each``.
     """
 
     name: str
     measure: str
-    over: str
+    over: str = ""
 
 
 class Published(_Part):
@@ -64,11 +64,27 @@ class Published(_Part):
 
 
 class Block(_Part):
-    """Columns that stand side by side, and what others have published of them."""
+    """Columns that stand side by side, and what others have published of them.
+
+    Attributes:
+        each: sequences that have a line of their own; columns are then over none in particular.
+    """
 
     title: str
     columns: tuple[Column, ...]
+    each: tuple[str, ...] = ()
     published: tuple[Published, ...] = ()
+
+    @property
+    def all_columns(self) -> tuple[Column, ...]:
+        """Return the columns of all lines."""
+        if not self.each:
+            return self.columns
+        return tuple(column for name in self.each for column in self.columns_of(name))
+
+    def columns_of(self, sequence: str) -> tuple[Column, ...]:
+        """Return the columns of the line that a sequence has for itself."""
+        return tuple(column.model_copy(update={"over": sequence}) for column in self.columns)
 
     @model_validator(mode="after")
     def _rows_fit(self) -> Self:
@@ -106,7 +122,7 @@ class Table(_Part):
     def _columns_have_sequences(self) -> Self:
         unknown = {name for group in self.groups.values() for name in group}
         unknown -= self.sequences.keys()
-        for column in (column for block in self.blocks for column in block.columns):
+        for column in (column for block in self.blocks for column in block.all_columns):
             if column.over not in self.sequences and column.over not in self.groups:
                 unknown.add(column.over)
         if unknown:
@@ -119,7 +135,7 @@ class Table(_Part):
 
     def measures_of(self, sequence: str) -> set[str]:
         """Return the measures that some column wants of a sequence."""
-        columns = (column for block in self.blocks for column in block.columns)
+        columns = (column for block in self.blocks for column in block.all_columns)
         return {column.measure for column in columns if sequence in self.members(column)}
 
 
