@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 import golden
 import pytest
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.nn import functional
 
 from laser_slam.errors import DependencyError, WeightsError
+from laser_slam.networks import dinov2
 from laser_slam.networks.dinov2 import BASE, LARGE_WITH_REGISTERS, Encoder, EncoderConfig
 from laser_slam.networks.weights import Checkpoint, load_weights
 
@@ -101,6 +105,33 @@ def test_keys_and_shapes_are_those_of_the_released_checkpoints(
         if key.startswith(prefix) and not key.endswith("mask_token")
     }
     assert ours == theirs
+
+
+@pytest.mark.parametrize("resampling", ["size", "factor"])
+def test_positions_are_resampled_where_apples_gpus_may_be_unable_to(
+    monkeypatch: pytest.MonkeyPatch, resampling: Literal["size", "factor"]
+) -> None:
+    """The meta device stands for one that is not here; only its way to the CPU must be made."""
+    assert dinov2.UNABLE == {"mps"}
+    monkeypatch.setattr(dinov2, "UNABLE", {"meta"})
+    resampled_on, interpolate, move = [], functional.interpolate, Tensor.to
+
+    def watch(maps: Tensor, **how: Any) -> Tensor:
+        resampled_on.append(maps.device.type)
+        return interpolate(maps, **how)
+
+    def to(tensor: Tensor, *where: Any, **how: Any) -> Tensor:
+        is_back = tensor.is_meta and where == ("cpu",)
+        return torch.zeros(tensor.shape) if is_back else move(tensor, *where, **how)
+
+    monkeypatch.setattr(functional, "interpolate", watch)
+    monkeypatch.setattr(Tensor, "to", to)
+    with torch.device("meta"):
+        encoder = Encoder(replace(TINY, resampling=resampling))
+    found = encoder.embed(torch.empty(1, 3, 28, 42, device="meta"))
+    assert resampled_on == ["cpu"]
+    assert found.device.type == "meta"
+    assert found.shape == (1, 11, 64)
 
 
 @pytest.mark.parametrize("how", ["weights", "autocast"])

@@ -8,7 +8,12 @@ import torch
 
 from laser_slam.errors import ConfigError
 from laser_slam.networks import placement
-from laser_slam.networks.placement import Placement, choose_placement, is_out_of_memory
+from laser_slam.networks.placement import (
+    Placement,
+    choose_placement,
+    full_precision,
+    is_out_of_memory,
+)
 
 CPU = Placement(torch.device("cpu"), torch.float32)
 
@@ -55,6 +60,25 @@ def test_apples_gpu_computes_in_float32(monkeypatch: pytest.MonkeyPatch, plain: 
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     assert chosen() == ("mps", "float32")
     assert chosen("auto", "float16") == ("mps", "float16")
+
+
+def test_where_pytorch_cannot_cast_nothing_is_cast(
+    monkeypatch: pytest.MonkeyPatch, plain: Path
+) -> None:
+    """As older ones cannot on Apple's GPUs: float32 is computed, float16 refused."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise RuntimeError("User specified an unsupported autocast device_type 'mps'")
+
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    monkeypatch.setattr(torch.amp, "is_autocast_available", lambda device: device == "cpu")
+    monkeypatch.setattr(torch, "autocast", refuse)
+    tokens = torch.ones(2, device="meta")
+    with Placement(torch.device("mps"), torch.float32).computing(), full_precision(tokens):
+        assert tokens.add(1).dtype == torch.float32
+    assert chosen() == ("mps", "float32")
+    with pytest.raises(ConfigError, match=r"pi3\.dtype: .* does not cast to float16 on 'mps'; use"):
+        chosen("auto", "float16")
 
 
 @pytest.mark.parametrize("feature", ["amx_bf16", "avx512_bf16"])
@@ -110,6 +134,29 @@ def test_images_arrive_as_planes_between_0_and_1() -> None:
     np.testing.assert_array_equal(
         uploaded[0].numpy(), images.transpose(0, 3, 1, 2).astype(np.float32) / 255
     )
+
+
+def test_images_go_to_a_gpu_from_pinned_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From any other, the copy would wait for the GPU, and the GPU for it."""
+    pinned: list[torch.Tensor] = []
+    moved: list[tuple[torch.Tensor, bool]] = []
+
+    def pin(pixels: torch.Tensor) -> torch.Tensor:
+        pinned.append(pixels.clone())
+        return pinned[-1]
+
+    def move(pixels: torch.Tensor, device: torch.device, non_blocking: bool) -> torch.Tensor:
+        assert device.type == "cuda"
+        moved.append((pixels, non_blocking))
+        return pixels
+
+    monkeypatch.setattr(torch.Tensor, "pin_memory", pin)
+    monkeypatch.setattr(torch.Tensor, "to", move)
+    Placement(torch.device("cuda"), torch.bfloat16).upload(np.zeros((3, 14, 28, 3), np.uint8))
+    ((pixels, does_not_wait),) = moved
+    assert pixels is pinned[0]
+    assert pixels.dtype == torch.uint8
+    assert does_not_wait
 
 
 def test_free_memory_is_the_machines_or_what_is_left_of_a_containers(

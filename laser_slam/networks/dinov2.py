@@ -22,6 +22,7 @@ NORMALISATION = {"image_mean": IMAGE_MEAN, "image_std": IMAGE_STD}  # as some ch
 PATCH = 14  # side, px
 COLOURS = 3
 NORM_EPS = 1e-6
+UNABLE = {"mps"}  # devices where not every PyTorch resamples; the table is small
 EXTRA = 0.1  # cells; part of the factor by which 'factor' resamples
 
 
@@ -126,10 +127,11 @@ class Encoder(nn.Module):
         grid = self.config.grid
         if rows == columns == grid:
             return self.pos_embed
-        table = self.pos_embed.float()
+        device = self.pos_embed.device
+        table = self.pos_embed.float().to("cpu" if device.type in UNABLE else device)
         square = table[:, 1:].transpose(1, 2).reshape(1, -1, grid, grid)
         resampled = self._resample(square, rows, columns).flatten(2).transpose(1, 2)
-        return torch.cat([table[:, :1], resampled], dim=1)
+        return torch.cat([table[:, :1], resampled], dim=1).to(device)
 
     def _resample(self, square: Tensor, rows: int, columns: int) -> Tensor:
         """Resample (1, D, grid, grid) to (1, D, rows, columns)."""

@@ -10,7 +10,7 @@ from laser_slam.networks.dinov2 import PATCH
 from laser_slam.networks.rope import Rotation
 from laser_slam.networks.transformer import Block, BlockConfig
 
-NUM_RESIDUALS = 2  # of a camera head
+NUM_RESIDUALS = 2  # of a pose head
 
 
 class HeadDecoder(nn.Module):
@@ -46,7 +46,7 @@ class PixelHead(nn.Module):
         return functional.pixel_shuffle(maps, PATCH).movedim(1, -1)
 
 
-class CameraHead(nn.Module):
+class PoseHead(nn.Module):
     """A frame's pose from the mean of its patches."""
 
     def __init__(self, width: int) -> None:

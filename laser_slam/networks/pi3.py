@@ -13,12 +13,12 @@ from torch import Tensor
 
 from laser_slam.networks.dinov2 import NORMALISATION
 from laser_slam.networks.heads import PixelHead, points_on_rays
+from laser_slam.networks.placement import full_precision
 from laser_slam.networks.trunk import (
     NUM_SPECIAL,
     Layout,
     Pi3Config,
     Trunk,
-    full_precision,
     keeps_full_precision,
 )
 from laser_slam.networks.weights import Checkpoint, load_weights

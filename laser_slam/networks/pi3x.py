@@ -31,6 +31,7 @@ from laser_slam.networks.dinov2 import (
 from laser_slam.networks.heads import points_on_rays
 from laser_slam.networks.metric import MetricConfig, MetricDecoder
 from laser_slam.networks.pi3 import Pi3Output
+from laser_slam.networks.placement import full_precision
 from laser_slam.networks.transformer import BlockConfig
 from laser_slam.networks.trunk import (
     NUM_SPECIAL,
@@ -40,7 +41,6 @@ from laser_slam.networks.trunk import (
     Layout,
     Pi3Config,
     Trunk,
-    full_precision,
     keeps_full_precision,
 )
 from laser_slam.networks.upsampling import UpsamplingHead

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,7 +65,10 @@ class Placement:
     def computing(self) -> Iterator[None]:
         """Keep no gradients; cast to float16 where that is the dtype."""
         casts = self.dtype == torch.float16
-        with torch.inference_mode(), torch.autocast(self.device.type, self.dtype, enabled=casts):
+        with (
+            torch.inference_mode(),
+            torch.autocast(self.device.type, self.dtype) if casts else nullcontext(),
+        ):
             yield
 
     def free_bytes(self) -> int:
@@ -99,9 +102,22 @@ def choose_placement(device: str, dtype: str, section: str) -> Placement:
         raise ConfigError(
             f"{section}.dtype: a CPU is slow with float16; use auto, bfloat16 or float32"
         )
+    if dtype == "float16" and not torch.amp.is_autocast_available(chosen.type):
+        raise ConfigError(
+            f"{section}.dtype: this PyTorch does not cast to float16 on '{chosen}'; use auto or "
+            "float32, or install a newer PyTorch"
+        )
     return Placement(
         chosen, {"float32": torch.float32, "bfloat16": torch.bfloat16}.get(dtype, torch.float16)
     )
+
+
+def full_precision(tokens: Tensor) -> AbstractContextManager[object]:
+    """Return a context without a surrounding autocast, for what half precision would spoil."""
+    device = tokens.device.type
+    if not torch.amp.is_autocast_available(device):
+        return nullcontext()  # then nothing surrounds it either
+    return torch.autocast(device, enabled=False)
 
 
 def is_out_of_memory(error: RuntimeError) -> bool:

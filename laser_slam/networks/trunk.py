@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from laser_slam.networks.dinov2 import LARGE_WITH_REGISTERS, PATCH, Encoder, EncoderConfig, Tokens
-from laser_slam.networks.heads import CameraHead, HeadDecoder
+from laser_slam.networks.heads import HeadDecoder, PoseHead
+from laser_slam.networks.placement import full_precision
 from laser_slam.networks.rope import Rotation, grid_positions, make_rotation
 from laser_slam.networks.transformer import Block, BlockConfig
 
@@ -97,7 +98,7 @@ class Trunk(nn.Module):
         self.point_decoder = self._make_decoder(width)
         self.conf_decoder = self._make_decoder(width)
         self.camera_decoder = self._make_decoder(config.camera_width)
-        self.camera_head = CameraHead(config.camera_width)
+        self.camera_head = PoseHead(config.camera_width)
 
     def _make_decoder(self, width_out: int) -> HeadDecoder:
         width = self.config.encoder.width
@@ -145,11 +146,6 @@ class Trunk(nn.Module):
         with full_precision(tokens):
             poses: Tensor = self.camera_head(tokens.float())
         return poses
-
-
-def full_precision(tokens: Tensor) -> torch.autocast:
-    """Return a context without a surrounding autocast, for what half precision would spoil."""
-    return torch.autocast(tokens.device.type, enabled=False)
 
 
 def keeps_full_precision(key: str) -> bool:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from laser_slam.networks.camera_head import CameraHead, CameraHeadConfig, decode_cameras
 from laser_slam.networks.dinov2 import LARGE_WITH_REGISTERS, PATCH, Encoder, EncoderConfig
 from laser_slam.networks.dpt import DenseHead, DptConfig
+from laser_slam.networks.placement import full_precision
 from laser_slam.networks.rope import grid_positions, make_rotation
 from laser_slam.networks.transformer import Block, BlockConfig
 from laser_slam.networks.weights import Checkpoint, load_weights
@@ -114,7 +115,7 @@ class Vggt(nn.Module):
             ValueError: H or W is no multiple of 14.
         """
         seen: Aggregated = self.aggregator(images)
-        with torch.autocast(images.device.type, enabled=False):
+        with full_precision(images):
             return self._read(seen, (images.shape[-2], images.shape[-1]))
 
     def _read(self, seen: Aggregated, size: tuple[int, int]) -> VggtOutput:
