@@ -40,6 +40,7 @@ from laser_slam.results import (
     fuse_run,
     list_keyframes,
     look_back,
+    place_window,
     sample_views,
     score_views,
     write_findings,
@@ -131,12 +132,12 @@ class Pipeline:
             with self._clock.stage("evaluate"):
                 found = self._evaluate(trajectory, tiles, raw)
             self._write(found)
-            report = self._report(found, warnings)
-            write_report(self.folder / "report.json", report)
-            write_report_page(self.folder)
             self._show(found)
+            report = self._report(found, warnings)
+            write_report(self.folder / "report.json", report)  # with it, the run is finished
         if self._is_named_here:
             link_latest(self.folder)
+        write_report_page(self.folder)
         return Results(self.folder, trajectory, found.cloud, report)
 
     def _make_closer(self) -> LoopCloser | None:
@@ -196,6 +197,9 @@ class Pipeline:
 
         with self._clock.stage("fuse"):
             tiles = fuse_run(self.folder, keyframes, self._config, load, watch, raw.add)
+            for node in self._slam.nodes:
+                if not raw.has(node.index):  # nothing in its part of the map had to be made
+                    raw.add(place_window(keyframes, node.index, load(node.index)))
         if not tiles.num_points:
             logger.warning("the map is empty: nothing was seen with confidence")
         return tiles, raw

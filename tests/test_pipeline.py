@@ -2,6 +2,7 @@
 
 import json
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,11 @@ from laser_slam.config import Config, load_config
 from laser_slam.errors import DatasetError, RunFolderError
 from laser_slam.pipeline import Pipeline
 from laser_slam.rescoring import rescore
-from laser_slam.results import Results
-from laser_slam.types import WindowStatus
+from laser_slam.results import Findings, Results
+from laser_slam.sim3 import Sim3
+from laser_slam.types import Cloud, Layers, Submap, Trajectory, WindowStatus
+from laser_slam.viewer import NullViewer
+from laser_slam.viewer.base import CandidateRecord
 
 NUM_FRAMES = 36
 CONFIG = load_config(
@@ -311,3 +315,81 @@ def test_a_truth_that_is_none_is_named(
     (tmp_path / "truth.txt").write_text(text)
     with pytest.raises(DatasetError, match=message):
         rescore(whole.folder, tmp_path / "truth.txt")
+
+
+class Watcher(NullViewer):
+    """Remember what a run shows."""
+
+    def __init__(self) -> None:
+        self.seen: list[str] = []
+
+    def window(self, submap: Submap, layers: Layers | None, times_s: np.ndarray) -> None:
+        assert times_s.tolist() == pytest.approx([frame / 10 for frame in submap.prediction.frames])
+        self.seen.append(f"window {submap.index}")
+
+    def loops(self, places: Sequence[Sim3], records: Sequence[CandidateRecord]) -> None:
+        self.seen.append(f"{len(places)} places")
+
+    def results(self, cloud: Cloud, path: Trajectory, path_without_loops: Trajectory) -> None:
+        assert len(cloud.points)
+        self.seen.append(f"{len(path.frames)} poses")
+
+    def close(self) -> None:
+        self.seen.append("closed")
+
+
+def test_a_viewer_sees_each_window_the_loops_and_the_end(tmp_path: Path, no_pictures: None) -> None:
+    viewer = Watcher()
+    Pipeline(
+        Corridor(16), CONFIG, tmp_path / "run", backbone=TrueBackbone(),
+        make_viewer=lambda _folder, _config: viewer,
+    ).run()  # fmt: skip
+    steps = ["window 0", "1 places", "window 1", "2 places", "window 2", "3 places"]
+    assert viewer.seen == [*steps, "3 places", "16 poses", "closed"]
+
+
+def test_a_viewer_is_closed_when_a_run_breaks_off(tmp_path: Path) -> None:
+    viewer = Watcher()
+    with pytest.raises(KeyboardInterrupt):
+        Pipeline(
+            Corridor(24), CONFIG, tmp_path / "run", backbone=TrueBackbone(interrupt_at=2),
+            make_viewer=lambda _folder, _config: viewer,
+        ).run()  # fmt: skip
+    assert viewer.seen[-1] == "closed"
+
+
+def test_a_resumed_run_draws_the_same_unfiltered_cloud_and_keeps_its_tiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Findings] = []
+    monkeypatch.setattr(
+        laser_slam.pipeline, "draw_findings", lambda _, found, *__: drawn.append(found)
+    )
+    monkeypatch.setattr(laser_slam.pipeline, "stages_picture", lambda *_: None)
+    stamps = []
+    for _ in range(2):
+        run(tmp_path / "run", TrueBackbone())
+        (tmp_path / "run" / "report.json").unlink()
+        tiles = sorted((tmp_path / "run" / "tiles").glob("*.npz"))
+        stamps.append([path.stat().st_mtime_ns for path in tiles])
+    first, again = (found.raw for found in drawn)
+    assert first is not None
+    assert again is not None
+    assert len(first.points) > 100_000
+    assert np.array_equal(first.points, again.points)
+    assert stamps[0] == stamps[1]
+
+
+def test_a_page_that_cannot_be_written_can_be_made_later(
+    tmp_path: Path, no_pictures: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_folder: Path) -> None:
+        raise RunFolderError("no space left on the disk")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(laser_slam.pipeline, "write_report_page", fail)
+        with pytest.raises(RunFolderError, match="no space"):
+            run(tmp_path / "run", TrueBackbone())
+    assert not (tmp_path / "run" / "report.html").exists()
+    rescore(tmp_path / "run")
+    assert (tmp_path / "run" / "report.html").exists()

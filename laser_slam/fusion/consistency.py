@@ -70,7 +70,7 @@ def _others(prediction: Prediction, row: int, rows: list[int], least: float) -> 
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _ask(depth: Any, others: Any, settings: Any, weight: Any, out: Any) -> None:
     tolerance, needed = settings
     height, width = depth.shape
@@ -92,7 +92,7 @@ def _ask(depth: Any, others: Any, settings: Any, weight: Any, out: Any) -> None:
                 out[v, u] = total / (agreeing + 1)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _difference(depth: Any, u: int, v: int, others: Any, k: int) -> Any:
     """Return how much deeper the other frame sees a pixel, and how deep it is; NaN: unseen."""
     m, height, width = others.from_ray[k], others.depth.shape[1], others.depth.shape[2]

@@ -7,7 +7,7 @@ from typing import Any
 from numba import njit
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def drop_edges(depth: Any, max_jump: float, weight: Any) -> None:
     """Set the weight of both pixels to 0 wherever depth jumps between neighbours.
 
@@ -24,7 +24,7 @@ def drop_edges(depth: Any, max_jump: float, weight: Any) -> None:
                 weight[v, u] = weight[v + 1, u] = 0.0
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _jumps(depth: Any, v: int, u: int, step: Any, max_jump: float) -> bool:
     here, there = depth[v, u], depth[v + step[0], u + step[1]]
     jump = abs(here - there) / min(here, there)

@@ -93,6 +93,21 @@ class TiledMap:
             return Update()
         self._files.open(entry.place for entry in plan.kept)
         aside = SumFiles(self._files.folder / "aside")
+        try:
+            made, kept = self._make(plan, voxel_size, aside, (load, watch))
+        finally:
+            aside.remove()
+        entries = sorted([*made, *kept], key=lambda entry: entry.place)
+        self._files.save_index(
+            TileIndex(voxel_size, self._settings(), _fingerprints(parts), entries)
+        )
+        return Update(tuple(plan.windows), tuple(entry.place for entry in made))
+
+    def _make(
+        self, plan: _Plan, voxel_size: float, aside: SumFiles, using: tuple[Load, Watch | None]
+    ) -> tuple[list[TileEntry], list[TileEntry]]:
+        """Make the tiles that are to be made; return them, and those that stay."""
+        load, watch = using
         sums = Accumulator(aside, self._config, voxel_size, plan.dirty)
         for row, index in enumerate(plan.windows):
             sums.add(load(index))
@@ -100,13 +115,7 @@ class TiledMap:
                 watch(row + 1, len(plan.windows))
         sums.flush()
         finisher = Finisher(self._files, aside, plan.kept, self._config)
-        made, kept = finisher.make(sums.windows), finisher.judge(plan.dirty or frozenset())
-        aside.remove()
-        entries = sorted([*made, *kept], key=lambda entry: entry.place)
-        self._files.save_index(
-            TileIndex(voxel_size, self._settings(), _fingerprints(parts), entries)
-        )
-        return Update(tuple(plan.windows), tuple(entry.place for entry in made))
+        return finisher.make(sums.windows), finisher.judge(plan.dirty or frozenset())
 
     def _settings(self) -> dict[str, Any]:
         return self._config.model_dump(mode="json", exclude=_OF_MEMORY)

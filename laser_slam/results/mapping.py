@@ -17,6 +17,7 @@ from laser_slam.store.keyframes import Keyframes
 from laser_slam.types import Submap
 
 TILES = "tiles"  # folder of a run
+DECIMALS = 9
 
 
 def fuse_run(
@@ -86,10 +87,13 @@ def place_window(keyframes: Keyframes, index: int, window: StoredWindow) -> Subm
 
 
 def _fingerprint(keyframes: Keyframes, index: int, stamp: str) -> str:
-    """Sum up all that a window's part of the map depends on."""
+    """Sum up all that a window's part of the map depends on.
+
+    Places count to nine decimals, for sums over threads are not quite the same each time.
+    """
     is_of = keyframes.windows == index
     digest = hashlib.blake2b(stamp.encode(), digest_size=16)
     digest.update(keyframes.frames[is_of].tobytes())
-    digest.update(keyframes.world_from_window[is_of].tobytes())
-    digest.update(keyframes.world_from_cam[is_of].tobytes())
+    for places in (keyframes.world_from_window[is_of], keyframes.world_from_cam[is_of]):
+        digest.update((places.round(DECIMALS) + 0.0).tobytes())  # no -0
     return digest.hexdigest()

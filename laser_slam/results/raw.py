@@ -23,6 +23,10 @@ class RawCloud:
         self._per_frame = max(1, MOST // max(1, num_keyframes))
         self._parts: dict[int, tuple[NDArray[np.float64], NDArray[np.uint8]]] = {}
 
+    def has(self, index: int) -> bool:
+        """Tell whether a window was there."""
+        return index in self._parts
+
     def add(self, submap: Submap) -> None:
         """Take pixels of the frames that a window owns; a window that comes again counts once."""
         frames = [self._pick(submap, int(i)) for i in np.flatnonzero(submap.is_owned)]
