@@ -80,6 +80,12 @@ def bench(data: Path, out: Path, *more: str) -> Result:
     return CliRunner().invoke(app, [*arguments, *more], env={"COLUMNS": "300"})
 
 
+def test_sequences_may_lie_in_the_data_folder_itself(data: Path) -> None:
+    spec = load_table("kitti").sequences["03"]
+    found = Material(data / "kitti_odometry").open(spec, load_config())
+    assert found.info.num_frames == NUM_FRAMES
+
+
 def test_a_table_runs_and_stands_beside_what_others_published(
     finished: tuple[Path, Result],
 ) -> None:
@@ -178,6 +184,11 @@ def test_every_shipped_table_can_be_run_as_it_stands() -> None:
             assert all(row.source for row in block.published)
 
 
+def test_the_command_names_every_table() -> None:
+    told = CliRunner().invoke(app, ["bench", "--help"], env={"COLUMNS": "200"}).output
+    assert all(name in told for name in table_names())
+
+
 @pytest.mark.parametrize("method", ["LASER (pi3)", "VGGT-Long", "pi3-Long"])
 def test_published_means_are_the_means_of_their_columns(method: str) -> None:
     """A value that was copied wrongly would move the mean away from the published one."""
@@ -270,7 +281,9 @@ def test_without_data_the_reason_says_how_to_pass_it(tmp_path: Path) -> None:
     assert found.reason is not None
     assert "pass --data, or set LASER_SLAM_DATA" in found.reason
     work = Bench(load_table("kitti"), Material(tmp_path / "nowhere"), tmp_path, only=("03",))
-    assert "no kitti_odometry" in str(work.run([Setting("ours")])[0].reason)
+    assert "no kitti_odometry or dataset or sequences in the data folder" in str(
+        work.run([Setting("ours")])[0].reason
+    )
 
 
 @pytest.mark.parametrize(
