@@ -372,6 +372,36 @@ def test_counters_of_new_parts_are_listed(bare: Path) -> None:
         assert words in text
 
 
+def test_counters_have_marks_at_their_thousands(bare: Path) -> None:
+    change(bare, map={"num_points": 4378311, "voxel_size": 0.02, "is_whole": True})
+    text = page_of(bare).text
+    assert "map.num_points 4,378,311 map.voxel_size 0.02 map.is_whole true" in text
+
+
+def test_sigmas_apart_have_a_column_where_a_closure_was_measured_twice(bare: Path) -> None:
+    closures = read(bare)["closures"]
+    for sigmas in (6543.0, None):
+        records = [row | {"disagreement": None} for row in closures["records"]]
+        records[-1]["disagreement"] = sigmas
+        change(bare, closures=closures | {"records": records})
+        text = page_of(bare).text
+        assert ("sigmas apart" in text) == ("6,543" in text) == (sigmas is not None)
+
+
+def test_every_file_of_a_run_says_what_it_holds(bare: Path) -> None:
+    for name in ("run.rrd", "keyframes.npz", "frames.npz", "images.json", "predictions.yaml"):
+        (bare / name).write_text("x")
+    (bare / "tiles").mkdir()
+    (bare / "tiles" / "index.json").write_text("x")
+    text = page_of(bare).text
+    assert "run.rrd 1 B the recording that rerun shows" in text
+    assert "keyframes.npz 1 B where the keyframes lie" in text
+    assert "frames.npz 1 B times of the frames" in text
+    assert "images.json 1 B the files of the input" in text
+    assert "predictions.yaml 1 B what the windows' predictions were made with" in text
+    assert "tiles/ 1 B 1 file: the map in parts" in text
+
+
 def test_a_path_too_short_for_kittis_scores_says_so(bare: Path) -> None:
     trajectory = read(bare)["trajectory"]
     nothing = {"t_rel_percent": None, "r_rel_deg_per_100m": None, "num_segments": 0}

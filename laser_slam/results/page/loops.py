@@ -124,7 +124,10 @@ def _table(found: Sequence[Report]) -> Table:
     caption = f"{len(found)} candidates, closed ones first"
     if len(shown) < len(found):
         caption += f"; {len(shown)} are shown, all are in closures.json"
-    return Table(caption, _HEAD, [_cells(row) for row in shown], frozenset({2}))
+    rows = [_cells(row) for row in shown]
+    is_measured_twice = any(row[-1] for row in rows)  # only then can they be sigmas apart
+    used = len(_HEAD) if is_measured_twice else len(_HEAD) - 1
+    return Table(caption, _HEAD[:used], [row[:used] for row in rows], frozenset({2}))
 
 
 def _cells(row: Report) -> list[str]:

@@ -173,13 +173,18 @@ _FOUR = ("fx", "fy", "cx", "cy")
 def _counters(report: Report) -> Block:
     """List every number that is no score, no series and no setting; new parts of a report too."""
     rows = [
-        [name, plain(value)]
+        [name, _mark_thousands(value)]
         for part in report
         if part not in _NO_COUNTERS
         for name, value in flatten({part: _without_series(report[part])})
     ]
     table = Table("Names as in report.json; null: unknown", ["counter", "value"], rows)
     return Fold("Counters", [table])
+
+
+def _mark_thousands(value: Any) -> str:
+    is_whole = isinstance(value, int) and not isinstance(value, bool)
+    return count(value) if is_whole else plain(value)
 
 
 def _without_series(part: Any) -> Any:
@@ -216,7 +221,9 @@ def _files(folder: Path) -> Block:
         if path.is_dir():
             inner = [each for each in path.rglob("*") if each.is_file()]
             size = sum(each.stat().st_size for each in inner)
-            row = [f"{path.name}/", file_size(size), f"{count(len(inner))} files"]
+            files = f"{count(len(inner))} file{'s' * (len(inner) != 1)}"
+            meaning = _MEANINGS.get(f"{path.name}/")
+            row = [f"{path.name}/", file_size(size), f"{files}: {meaning}" if meaning else files]
         else:
             row = [path.name, file_size(path.stat().st_size), _MEANINGS.get(path.name, "")]
         links[len(rows)] = quote(row[0])
@@ -241,4 +248,13 @@ _MEANINGS = {
     "closures.json": "what became of each candidate of a loop",
     "graph.g2o": "the pose graph",
     "run.log": "what the run said",
+    "run.rrd": "the recording that rerun shows",
+    "keyframes.npz": "where the keyframes lie, and which windows own them",
+    "frames.npz": "times of the frames, and which of them cannot be read",
+    "images.json": "the files of the input, and their camera",
+    "predictions.yaml": "what the windows' predictions were made with",
+    "layers/": "depth layers of each window, and their scales",
+    "pictures/": "the pictures of this page",
+    "tiles/": "the map in parts, as exports and viewers read it",
+    "windows/": "what the backbone saw in each window",
 }
