@@ -199,6 +199,14 @@ def test_published_means_are_the_means_of_their_columns(method: str) -> None:
     assert (sum(values[2:]) - values[3]) / 10 == pytest.approx(values[1], abs=0.006)
 
 
+@pytest.mark.parametrize("block", [0, 1, 2])
+def test_published_means_over_waymo_are_those_of_their_segments(block: int) -> None:
+    for row in load_table("waymo").blocks[block].published:
+        mean, *values = (float(value) for value in row.values if isinstance(value, float | int))
+        assert len(values) == 9
+        assert sum(values) / 9 == pytest.approx(mean, abs=0.0011), row.method
+
+
 def outcome(name: str, ate: float | None, reason: str | None = None) -> Outcome:
     scores = {"run": {"trajectory": {"ate_sim3_m": {"rmse": ate}}}}
     return Outcome("ours", name, {} if reason else scores, reason)
