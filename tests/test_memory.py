@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import weakref
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from laser_slam.backbones import choose_window_size
 from laser_slam.backbones.feedforward import window as window_module
 from laser_slam.config import load_config
 from laser_slam.networks import placement
-from laser_slam.networks.memory import MARGIN, Job, advise
+from laser_slam.networks.memory import MARGIN, Request, advise
 from laser_slam.networks.pi3 import Pi3, Pi3Config
 from laser_slam.networks.pi3x import Pi3X, Pi3XConfig
 from laser_slam.networks.trunk import keeps_full_precision
@@ -61,85 +60,84 @@ class Count(TorchDispatchMode):  # type: ignore[no-untyped-call]
         self.peak = max(self.peak, self.now)
 
 
-def full_size(job: Job) -> nn.Module:
+def full_size(asked: Request) -> nn.Module:
     """Return the network without memory for its weights."""
     with torch.device("meta"):
         made: dict[str, nn.Module] = {
-            "pi3": Pi3(Pi3Config(), job.chunk),
-            "pi3x": Pi3X(Pi3XConfig(), job.chunk),
-            "vggt": Vggt(VggtConfig(chunk=job.chunk)),
+            "pi3": Pi3(Pi3Config(), asked.chunk),
+            "pi3x": Pi3X(Pi3XConfig(), asked.chunk),
+            "vggt": Vggt(VggtConfig(chunk=asked.chunk)),
         }
-    network = made[job.network]
+    network = made[asked.network]
     for key, weight in network.named_parameters():
         is_head = not key.startswith("aggregator.")
-        if not (is_head if job.network == "vggt" else keeps_full_precision(key)):
-            weight.data = weight.data.to(getattr(torch, job.dtype))
+        if not (is_head if asked.network == "vggt" else keeps_full_precision(key)):
+            weight.data = weight.data.to(getattr(torch, asked.dtype))
     return network.requires_grad_(requires_grad=False).eval()
 
 
-def counted(job: Job, num_frames: int, monkeypatch: pytest.MonkeyPatch) -> int:
+def counted(asked: Request, num_frames: int, monkeypatch: pytest.MonkeyPatch) -> int:
     """Run a network that computes nothing, and return the most that was alive."""
-    network = full_size(job)
+    network = full_size(asked)
     # Fused attention makes its result and no more; a device without numbers has no fused form.
     monkeypatch.setattr(
         functional, "scaled_dot_product_attention", lambda q, k, v: torch.empty_like(q)
     )
-    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())
     with torch.inference_mode(), Count(network) as count:
-        network(torch.empty(1, num_frames, 3, *job.size, device="meta"))
+        network(torch.empty(1, num_frames, 3, *asked.size, device="meta"))
     return int(count.peak)
 
 
 @pytest.mark.parametrize(
-    ("job", "num_frames"),
+    ("asked", "num_frames"),
     [
-        (Job("pi3", KITTI, "bfloat16"), 20),  # blocks take the most
-        (Job("pi3", (266, 392), "float32"), 8),  # the heads do
-        (Job("pi3x", KITTI, "bfloat16"), 9),
-        (Job("vggt", KITTI, "bfloat16"), 20),
-        (Job("vggt", KITTI, "float32", chunk=1), 20),
+        (Request("pi3", KITTI, "bfloat16"), 20),  # blocks take the most
+        (Request("pi3", (266, 392), "float32"), 8),  # the heads do
+        (Request("pi3x", KITTI, "bfloat16"), 9),
+        (Request("vggt", KITTI, "bfloat16"), 20),
+        (Request("vggt", KITTI, "float32", chunk=1), 20),
     ],
 )
 def test_the_formula_is_what_the_network_allocates(
-    job: Job, num_frames: int, monkeypatch: pytest.MonkeyPatch
+    asked: Request, num_frames: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected = counted(job, num_frames, monkeypatch)
-    assert job.window_bytes(num_frames) == pytest.approx(expected, rel=0.03)
+    expected = counted(asked, num_frames, monkeypatch)
+    assert asked.window_bytes(num_frames) == pytest.approx(expected, rel=0.03)
 
 
 @pytest.mark.parametrize("network", ["pi3", "pi3x", "vggt"])
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_weights_are_counted(network: str, dtype: str) -> None:
-    job = Job(network, KITTI, dtype)
-    found = sum(weight.numel() * weight.element_size() for weight in full_size(job).parameters())
-    assert job.weights_bytes() == found
+    asked = Request(network, KITTI, dtype)
+    found = sum(weight.numel() * weight.element_size() for weight in full_size(asked).parameters())
+    assert asked.weights_bytes() == found
 
 
 @pytest.mark.parametrize("network", ["pi3", "pi3x", "vggt"])
 @pytest.mark.parametrize("free_gb", [3, 6, 12, 24])
 def test_the_largest_window_fits_and_one_more_frame_does_not(network: str, free_gb: int) -> None:
-    job, free = Job(network, KITTI, "bfloat16"), free_gb * 10**9
-    most = job.largest_window(free)
-    assert job.weights_bytes() + MARGIN * job.window_bytes(most) <= free or most == 0
-    assert job.weights_bytes() + MARGIN * job.window_bytes(most + 1) > free
-    assert job.largest_window(free - job.weights_bytes(), has_weights=True) == most
+    asked, free = Request(network, KITTI, "bfloat16"), free_gb * 10**9
+    most = asked.largest_window(free)
+    assert asked.weights_bytes() + MARGIN * asked.window_bytes(most) <= free or most == 0
+    assert asked.weights_bytes() + MARGIN * asked.window_bytes(most + 1) > free
+    assert asked.largest_window(free - asked.weights_bytes(), has_weights=True) == most
 
 
 def test_nothing_fits_where_there_is_no_room_for_the_weights() -> None:
-    assert Job("pi3", KITTI, "float32").largest_window(3 << 30) == 0
+    assert Request("pi3", KITTI, "float32").largest_window(3 << 30) == 0
 
 
 def test_float16_is_counted_as_the_float32_that_its_weights_are() -> None:
-    half, whole = Job("pi3", KITTI, "float16"), Job("pi3", KITTI, "float32")
+    half, whole = Request("pi3", KITTI, "float16"), Request("pi3", KITTI, "float32")
     assert half.weights_bytes() == whole.weights_bytes()
 
 
 def test_advice_names_a_size_that_fits_and_a_side_that_does() -> None:
-    job = Job("vggt", KITTI, "bfloat16")
-    text = advise(job, 75, 1 << 30, "backbone.vggt")
-    fits = job.largest_window(1 << 30, has_weights=True)
+    asked = Request("vggt", KITTI, "bfloat16")
+    text = advise(asked, 75, 1 << 30, "backbone.vggt")
+    fits = asked.largest_window(1 << 30, has_weights=True)
     assert f"lower windows.size to {fits} (or auto), or lower backbone.vggt.side to" in text
-    assert "windows.size" not in advise(job, 4, 1 << 28, "backbone.vggt")
+    assert "windows.size" not in advise(asked, 4, 1 << 28, "backbone.vggt")
 
 
 def test_the_documents_tables_are_those_of_the_formula(capsys: pytest.CaptureFixture[str]) -> None:
@@ -164,7 +162,7 @@ def test_a_window_is_as_large_as_memory_allows_up_to_what_is_good(
 ) -> None:
     some = choose(4.2, monkeypatch)
     assert 8 < some < window_module.MOST_FRAMES
-    assert some == Job("vggt", KITTI, "bfloat16").largest_window(int(4.2e9))
+    assert some == Request("vggt", KITTI, "bfloat16").largest_window(int(4.2e9))
     assert choose(80, monkeypatch) == window_module.MOST_FRAMES
     assert not caplog.records
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from perfect import settings
 from tiny import ENCODER, FRAMES, GIVEN, SIZE, TINY, K, filled, images, make_pi3x, make_vggt
 
-from laser_slam.backbones import NETWORKS
+from laser_slam.backbones import NETWORKS, is_on_cpu
 from laser_slam.backbones.feedforward import NetworkBackbone
 from laser_slam.backbones.pi3 import Pi3Backbone
 from laser_slam.backbones.pi3x import Pi3XBackbone
@@ -24,14 +23,7 @@ from laser_slam.pipeline import Pipeline
 from laser_slam.store import load_prediction
 from laser_slam.types import WindowStatus
 
-
-@pytest.fixture(scope="module", autouse=True)
-def _one_thread() -> Iterator[None]:
-    """Leave waiting threads out: what is computed here is tiny."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +85,16 @@ def test_what_overflows_is_a_failed_window(pi3: Pi3) -> None:
     found = Pi3Backbone(settings(), broken).predict(images(), FRAMES, None)
     assert found.status is WindowStatus.FAILED
     assert "no finite depth" in found.warnings[0]
+
+
+@pytest.mark.parametrize("name", [*sorted(NETWORKS), "depth_anything3"])
+def test_a_network_that_is_to_compute_on_the_cpu_wants_no_gpu(name: str) -> None:
+    for device, expected in {"cpu": True, "cpu:0": True, "cuda:1": False, "auto": False}.items():
+        chosen = settings(f"backbone.name={name}", f"backbone.{name}.device={device}")
+        assert is_on_cpu(chosen) is expected
+    assert is_on_cpu(settings("backbone.name=classical"))
+    other = settings("backbone.name=classical", f"backbone.{name}.device=cuda")
+    assert is_on_cpu(other)  # its device matters when it is used only
 
 
 # --- a whole run -------------------------------------------------------------------------------

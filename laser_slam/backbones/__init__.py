@@ -72,4 +72,5 @@ def choose_window_size(config: BackboneConfig, size: tuple[int, int], overlap: i
 
 def is_on_cpu(config: BackboneConfig) -> bool:
     """Tell whether the backbone has no use for a GPU."""
-    return config.name in ON_CPU
+    section = getattr(config, config.name, None)
+    return config.name in ON_CPU or getattr(section, "device", "").startswith("cpu")

@@ -11,7 +11,7 @@ from laser_slam.config.loading import (
     setting_names,
     shipped_configs,
 )
-from laser_slam.config.networks import NetworkConfig, Pi3XConfig
+from laser_slam.config.networks import DeviceConfig, NetworkConfig, Pi3XSettings
 from laser_slam.config.places import PlacesConfig, VerificationConfig
 from laser_slam.config.sections import (
     CalibrationConfig,
@@ -33,10 +33,11 @@ __all__ = [
     "ClosuresConfig",
     "Config",
     "DatasetConfig",
+    "DeviceConfig",
     "FusionConfig",
     "LayersConfig",
     "NetworkConfig",
-    "Pi3XConfig",
+    "Pi3XSettings",
     "PlacesConfig",
     "PoseGraphConfig",
     "RegistrationConfig",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from laser_slam.config.networks import DepthAnything3Config, NetworkConfig, Pi3XConfig
+from laser_slam.config.networks import DepthAnything3Config, NetworkConfig, Pi3XSettings
 from laser_slam.config.section import Section
 from laser_slam.config.simulated import SimulatedConfig
 
@@ -39,7 +39,7 @@ class BackboneConfig(Section):
     classical: ClassicalConfig = ClassicalConfig()
     simulated: SimulatedConfig = SimulatedConfig()
     pi3: NetworkConfig = NetworkConfig()
-    pi3x: Pi3XConfig = Pi3XConfig()
+    pi3x: Pi3XSettings = Pi3XSettings()
     vggt: NetworkConfig = NetworkConfig()
     depth_anything3: DepthAnything3Config = DepthAnything3Config()
     replay: ReplayConfig = ReplayConfig()

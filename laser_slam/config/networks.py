@@ -9,13 +9,18 @@ from pydantic import Field
 from laser_slam.config.section import Section
 
 
-class NetworkConfig(Section):
-    """What all networks have in common."""
+class DeviceConfig(Section):
+    """Where a network computes, ours or one of somebody else's package."""
+
+    device: str = Field("auto", description="cpu, cuda, cuda:1, mps; auto: the best that is there")
+
+
+class NetworkConfig(DeviceConfig):
+    """What all networks of ours have in common."""
 
     weights: str = Field(
         "", description="checkpoint file, .safetensors or .pt; empty: from the Hugging Face hub"
     )
-    device: str = Field("auto", description="cpu, cuda, cuda:1, mps; auto: the best that is there")
     dtype: Literal["auto", "float32", "bfloat16", "float16"] = Field(
         "auto", description="of all layers but the heads; auto: what the device is fast at"
     )
@@ -36,17 +41,16 @@ class NetworkConfig(Section):
         return self.side if self.size_rule == "side" else self.num_pixels
 
 
-class Pi3XConfig(NetworkConfig):
+class Pi3XSettings(NetworkConfig):
     """Pi3X, which is told of the camera."""
 
     told_intrinsics: bool = Field(True, description="known intrinsics are a prior of the network")
 
 
-class DepthAnything3Config(Section):
+class DepthAnything3Config(DeviceConfig):
     """Depth Anything 3, by its authors' own package."""
 
     model: str = Field(
         "depth-anything/DA3-BASE", description="name on the Hugging Face hub, or a folder"
     )
-    device: str = Field("auto", description="cpu, cuda, cuda:1, mps; auto: the best that is there")
     side: int = Field(504, ge=28, le=4096, multiple_of=14, description="longer side of images, px")

@@ -1,8 +1,9 @@
 """How much memory a window takes, and so how many frames fit; computed, for any device.
 
-Attention is fused, so nothing is quadratic in tokens: what is alive at once is so many numbers a
-token while blocks work, and so many bytes a pixel of the frames that a head takes at once. The
-numbers are those of the networks' own tensors, counted op by op (tests/test_memory.py does so).
+Attention is fused on CUDA devices and CPUs, so nothing there is quadratic in tokens: what is alive
+at once is so many numbers a token while blocks work, and so many bytes a pixel of the frames that a
+head takes at once. The numbers are those of the networks' own tensors, counted op by op
+(tests/test_memory.py does so). Where PyTorch has no fused form, more is needed for long windows.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ APPETITES = {
 
 
 @dataclass(frozen=True)
-class Job:
+class Request:
     """What is asked of a network.
 
     Attributes:
@@ -104,24 +105,24 @@ class Job:
         return low
 
 
-def advise(job: Job, num_frames: int, free_bytes: int, section: str) -> str:
+def advise(request: Request, num_frames: int, free_bytes: int, section: str) -> str:
     """Say in one line what to do about a window that did not fit.
 
     Args:
-        job: that was asked for.
+        request: that was asked for.
         num_frames: of the window.
         free_bytes: that were there beside the weights.
         section: of the network's settings.
     """
-    height, width = job.size
+    height, width = request.size
     # The count said that it fits where it is off; a quarter less is a good next try.
-    fits = min(job.largest_window(free_bytes, has_weights=True), 3 * num_frames // 4)
+    fits = min(request.largest_window(free_bytes, has_weights=True), 3 * num_frames // 4)
     shrinks = min(fits / num_frames, 1.0) if fits else 0.25
-    side = max(int(max(job.size) * sqrt(shrinks)) // PATCH_PX, 2) * PATCH_PX
+    side = max(int(max(request.size) * sqrt(shrinks)) // PATCH_PX, 2) * PATCH_PX
     smaller = f"lower {section}.side to {side}"
     fewer = f"lower windows.size to {fits} (or auto), or " if fits > 3 else ""
     return (
         f"no memory for {num_frames} frames of {width}x{height}, about "
-        f"{job.window_bytes(num_frames) / 1e9:.1f} GB of {free_bytes / 1e9:.1f} GB free: "
+        f"{request.window_bytes(num_frames) / 1e9:.1f} GB of {free_bytes / 1e9:.1f} GB free: "
         f"{fewer}{smaller}"
     )

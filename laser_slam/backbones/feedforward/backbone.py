@@ -152,20 +152,22 @@ class NetworkBackbone(ABC):
         Returns:
             A view of nothing, where numbers have overflowed inside of the network.
         """
-        from laser_slam.networks.memory import Job, advise  # noqa: PLC0415
+        from laser_slam.networks.memory import Request, advise  # noqa: PLC0415
         from laser_slam.networks.placement import is_out_of_memory, is_overflow  # noqa: PLC0415
 
         if is_overflow(error):
             return blind_view((shape[0], shape[1], shape[2]))
         if not is_out_of_memory(error):
             raise error
-        job = Job(self.name, (shape[1], shape[2]), self._placement.dtype_name, self._config.chunk)
-        advice = advise(job, shape[0], free_bytes, f"backbone.{self.name}")
+        request = Request(
+            self.name, (shape[1], shape[2]), self._placement.dtype_name, self._config.chunk
+        )
+        advice = advise(request, shape[0], free_bytes, f"backbone.{self.name}")
         raise ConfigError(advice) from error
 
     @cached_property
     def _network(self) -> Any:
-        from laser_slam.networks.memory import Job  # noqa: PLC0415
+        from laser_slam.networks.memory import Request  # noqa: PLC0415
         from laser_slam.networks.placement import is_out_of_memory  # noqa: PLC0415
 
         network = self._given if self._weights is None else self._load(self._weights)
@@ -174,7 +176,7 @@ class NetworkBackbone(ABC):
         except RuntimeError as error:
             if not is_out_of_memory(error):
                 raise
-            size = Job(self.name, (1, 1), self._placement.dtype_name).weights_bytes() / 1e9
+            size = Request(self.name, (1, 1), self._placement.dtype_name).weights_bytes() / 1e9
             section = f"backbone.{self.name}"
             raise ConfigError(
                 f"no memory for the weights of {self.name} on {self._placement.device}, "

@@ -29,13 +29,13 @@ def fitting_window(name: str, config: NetworkConfig, size: tuple[int, int], over
         DependencyError: PyTorch is not installed.
     """
     import_torch()
-    from laser_slam.networks.memory import Job  # noqa: PLC0415  (networks are for use only)
+    from laser_slam.networks.memory import Request  # noqa: PLC0415  (networks are for use only)
     from laser_slam.networks.placement import choose_placement  # noqa: PLC0415
 
     placement = choose_placement(config.device, config.dtype, f"backbone.{name}")
     wanted = network_size(size, config.size_rule, config.size_limit)
-    job = Job(name, wanted, placement.dtype_name, config.chunk)
-    fits, least = job.largest_window(placement.free_bytes()), overlap + LEAST_NEW
+    request = Request(name, wanted, placement.dtype_name, config.chunk)
+    fits, least = request.largest_window(placement.free_bytes()), overlap + LEAST_NEW
     if fits < least:
         logger.warning(
             "%s has memory for windows of %d frames, but an overlap of %d needs %d: "
