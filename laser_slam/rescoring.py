@@ -29,6 +29,8 @@ Array = NDArray[np.float64]
 def rescore(folder: Path, truth_file: Path | None = None) -> dict[str, Any]:
     """Compare a run's trajectory with the truth; write its scores, their pictures and page anew.
 
+    Where there is no truth and the page is missing, only that is written.
+
     Args:
         folder: of a finished run.
         truth_file: poses in metres, KITTI's format (a line for every frame) or TUM's (by time);
@@ -42,14 +44,23 @@ def rescore(folder: Path, truth_file: Path | None = None) -> dict[str, Any]:
         DatasetError: there is no truth, it cannot be read or does not fit the run.
     """
     report = dict(read_report(folder))
-    trajectory = read_trajectory(folder / "trajectory_tum.txt", None)
     kept = folder / "truth_tum.txt"
-    if truth_file is None and not kept.exists():
+    if truth_file is not None or kept.exists():
+        _score(folder, report, truth_file or kept, has_same_truth=truth_file is None)
+        write_report(folder / "report.json", report)
+    elif (folder / "report.html").exists():
         raise DatasetError(f"the run in {folder} had no truth; pass a file of poses with --truth")
-    truth = read_trajectory(truth_file or kept, trajectory.times_s)
+    write_report_page(folder)
+    return report
+
+
+def _score(folder: Path, report: dict[str, Any], file: Path, *, has_same_truth: bool) -> None:
+    """Put the scores by a truth into a report."""
+    trajectory = read_trajectory(folder / "trajectory_tum.txt", None)
+    truth = read_trajectory(file, trajectory.times_s)
     errors = evaluate_trajectory(trajectory, truth)
     if errors.reason is not None:
-        raise DatasetError(f"{truth_file or kept} cannot score {folder}: {errors.reason}")
+        raise DatasetError(f"{file} cannot score {folder}: {errors.reason}")
     draw_trajectory(folder / "pictures", trajectory, truth, errors)
     before = _metres_per_unit(report)
     report["trajectory"] = errors.numbers()
@@ -63,11 +74,8 @@ def rescore(folder: Path, truth_file: Path | None = None) -> dict[str, Any]:
         now = _metres_per_unit(report | {"windows": {"unit": "m"}})
         metres = (_ratio(now[0], before[0]), _ratio(now[1], before[1]))
         report["windows"] = rescale_windows(
-            report["windows"], metres, has_same_truth=truth_file is None
+            report["windows"], metres, has_same_truth=has_same_truth
         )
-    write_report(folder / "report.json", report)
-    write_report_page(folder)
-    return report
 
 
 def _metres_per_unit(report: dict[str, Any]) -> tuple[float | None, float | None]:

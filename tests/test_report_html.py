@@ -17,8 +17,10 @@ import pytest
 from browser import Browser
 from corridor import Corridor, TrueBackbone
 from ring import NUM_FRAMES, TIMES_S, Drift, black, chain, prediction_of, ring_pose, true_link
+from typer.testing import CliRunner
 
 import laser_slam.pipeline
+from laser_slam.cli import app
 from laser_slam.closures import ClosureRecord
 from laser_slam.config import load_config
 from laser_slam.errors import RunFolderError
@@ -490,6 +492,17 @@ def test_a_run_and_a_new_truth_rewrite_the_page(
     text = Parsed((tmp_path / "run" / "report.html").read_text()).text
     assert f"over {3 * length:.1f} m" in text
     assert max(report["paths"]["truth"]["z"]) == pytest.approx(table[:, 3].max(), abs=0.01)
+
+
+def test_a_missing_page_is_written_again_without_a_truth(bare: Path) -> None:
+    before = (bare / "report.json").read_bytes()
+    done = CliRunner().invoke(app, ["eval", str(bare)])
+    assert done.exit_code == 0, done.output
+    assert "ring" in Parsed((bare / "report.html").read_text()).text
+    assert (bare / "report.json").read_bytes() == before
+    refused = CliRunner().invoke(app, ["eval", str(bare)])
+    assert refused.exit_code == 1
+    assert "had no truth; pass a file of poses with --truth" in " ".join(refused.output.split())
 
 
 def test_another_truth_moves_the_windows_scales_into_its_metres(
