@@ -35,9 +35,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         for file in partial.rglob("*"):
             if file.is_file() and not file.is_symlink():
                 flush(file)
-        if path.exists():
-            path.replace(old)
-        partial.replace(path)
+        _put(partial, path, old)
     except OSError as error:
         raise RunFolderError(
             f"cannot write {path}: {error.strerror or error}; "
@@ -49,6 +47,16 @@ def atomic_folder(path: Path) -> Iterator[Path]:
                 old.replace(path)
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
+
+
+def _put(partial: Path, path: Path, old: Path) -> None:
+    if path.is_dir() and not any(path.iterdir()):
+        for entry in list(partial.iterdir()):  # it stays the folder that someone may be in
+            entry.replace(path / entry.name)
+        return
+    if path.exists():
+        path.replace(old)
+    partial.replace(path)
 
 
 def check_replaceable(path: Path) -> None:
