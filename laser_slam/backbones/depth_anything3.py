@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from importlib import import_module
+import json
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from importlib import import_module, metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,11 +27,16 @@ from laser_slam.dependencies import import_torch
 from laser_slam.errors import DependencyError, WeightsError
 from laser_slam.types import Calibration, Image, Prediction, Window
 
+PACKAGE = "depth-anything-3"
+WEIGHTS = "model.safetensors"
 FORMAT = 1  # rises when the same model makes other predictions of the same images
 
 
 class DepthAnything3Backbone:
     """Depth Anything 3 (arXiv:2511.10647); the package is not part of laser-slam.
+
+    What is wrong with device or package is said at once; the model is read when the first window
+    is predicted.
 
     Attributes:
         remembers: False, see `laser_slam.backbones.base.Backbone`.
@@ -39,20 +49,41 @@ class DepthAnything3Backbone:
     Raises:
         ConfigError: the device is not there.
         DependencyError: the package is not installed.
-        WeightsError: the model cannot be downloaded or read.
     """
 
     remembers = False
     sees_far_frames = True
 
     def __init__(self, config: BackboneConfig, model: Any = None) -> None:
+        torch = import_torch()
+        from laser_slam.networks.placement import choose_placement  # noqa: PLC0415  (needs torch)
+
         self._config = config.depth_anything3
-        self._model = _load(self._config.model, self._config.device) if model is None else model
+        self._device = choose_placement(
+            self._config.device, "float32", "backbone.depth_anything3"
+        ).device
+        # The package's own rule, on every device.
+        is_new = torch.cuda.is_available() and torch.cuda.is_bf16_supported()
+        self._dtype = "bfloat16" if is_new else "float16"
+        self._given = model
+        self._package = None if model is not None else _import_package()
+        self._one_at_a_time = threading.Lock()  # windows of loops come from another thread
 
     def identity(self) -> dict[str, Any]:
-        """Return model and size; see `laser_slam.backbones.base.Backbone`."""
+        """Return package, model and size; see `laser_slam.backbones.base.Backbone`.
+
+        Raises:
+            WeightsError: the model is not here, and the hub does not say which one it would be.
+        """
         config = self._config
-        return {"model": config.model, "size": {"side": config.side}, "format": FORMAT}
+        return {
+            "model": config.model,
+            "revision": self._revision,
+            "package": _package_version(),
+            "dtype": self._dtype,
+            "size": {"side": config.side},
+            "format": FORMAT,
+        }
 
     def image_size(self, size: tuple[int, int]) -> tuple[int, int]:
         """Return the (height, width) that the package would make of (height, width) ``size``."""
@@ -73,9 +104,11 @@ class DepthAnything3Backbone:
         """Predict one window; see `laser_slam.backbones.base.Backbone`.
 
         Raises:
-            WeightsError: the model is one for single images, which gives no poses.
+            WeightsError: the model cannot be downloaded or read, or is one for single images,
+                which gives no poses.
         """
-        seen = self._model.inference(list(images), process_res=self._config.side)
+        with self._one_at_a_time:
+            seen = self._model.inference(list(images), process_res=self._config.side)
         if seen.extrinsics is None or seen.intrinsics is None or seen.conf is None:
             raise WeightsError(
                 f"backbone.depth_anything3.model: {self._config.model} gives no poses; "
@@ -91,25 +124,68 @@ class DepthAnything3Backbone:
         )
         return to_prediction(view, frames)
 
+    @cached_property
+    def _model(self) -> Any:
+        if self._package is None:
+            return self._given
+        name, revision = self._config.model, self._revision
+        folder = Path(name).expanduser()
+        with _told_as_weights_error(name):
+            which = (str(folder), None) if folder.is_dir() else (name, revision)
+            model = self._package.DepthAnything3.from_pretrained(which[0], revision=which[1])
+        return model.to(self._device).eval()
 
-def _load(name: str, device: str) -> Any:
-    import_torch()
-    from laser_slam.networks.placement import choose_placement  # noqa: PLC0415  (needs torch)
+    @cached_property
+    def _revision(self) -> str:
+        """The commit of the model on the hub, the hash of a folder's file; empty: was given."""
+        if self._package is None:
+            return ""
+        from laser_slam.networks.hub import hash_file  # noqa: PLC0415  (needs torch)
 
-    chosen = choose_placement(device, "float32", "backbone.depth_anything3").device
+        folder = Path(self._config.model).expanduser()
+        with _told_as_weights_error(self._config.model):
+            return hash_file(folder / WEIGHTS) if folder.is_dir() else _commit(self._config.model)
+
+
+def _import_package() -> Any:
     try:
-        package = import_module("depth_anything_3.api")  # not everyone has it
+        return import_module("depth_anything_3.api")  # not everyone has it
     except ImportError as error:
         raise DependencyError(
             f"backbone.name: depth_anything3 needs its authors' package ({error}); install it: "
             "pip install git+https://github.com/ByteDance-Seed/Depth-Anything-3"
         ) from error
+
+
+def _package_version() -> str:
+    """Return version and commit: its authors count no versions."""
     try:
-        model = package.DepthAnything3.from_pretrained(name)
+        found = metadata.distribution(PACKAGE)
+    except metadata.PackageNotFoundError:
+        return "unknown"
+    origin = json.loads(found.read_text("direct_url.json") or "{}")  # what pip was told
+    commit = origin.get("vcs_info", {}).get("commit_id", "")
+    return f"{found.version} {commit}".strip()
+
+
+def _commit(repo: str) -> str:
+    """Return which commit of a repository on the hub is on this machine, else the newest."""
+    from huggingface_hub import hf_hub_download  # noqa: PLC0415  (it comes with the package)
+
+    try:
+        file = hf_hub_download(repo, "config.json", local_files_only=True)
+    except FileNotFoundError:
+        file = hf_hub_download(repo, "config.json")
+    return Path(file).parent.name  # snapshots/<commit>/config.json
+
+
+@contextmanager
+def _told_as_weights_error(name: str) -> Iterator[None]:
+    try:
+        yield
     except (OSError, ValueError, RuntimeError) as error:
         first = str(error).strip().splitlines()[0][:120] if str(error).strip() else "no reason"
         raise WeightsError(
             f"backbone.depth_anything3.model: '{name}' cannot be had ({first}); give a folder "
             "that holds its config.json and model.safetensors, or a name on the Hugging Face hub"
         ) from error
-    return model.to(chosen).eval()
