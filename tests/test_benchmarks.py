@@ -289,9 +289,19 @@ def test_without_data_the_reason_says_how_to_pass_it(tmp_path: Path) -> None:
     assert found.reason is not None
     assert "pass --data, or set LASER_SLAM_DATA" in found.reason
     work = Bench(load_table("kitti"), Material(tmp_path / "nowhere"), tmp_path, only=("03",))
-    assert "no kitti_odometry or dataset or sequences in the data folder" in str(
+    assert "not there, in kitti_odometry or dataset or sequences of the data" in str(
         work.run([Setting("ours")])[0].reason
     )
+
+
+def test_what_lies_nowhere_is_one_line_for_all_of_it(tmp_path: Path) -> None:
+    table = load_table("depth")
+    work = Bench(table, Material(tmp_path), tmp_path / "out", only=("bonn",))
+    outcomes = work.run(parse_settings([], table))
+    lines = list(list_missing([], outcomes))
+    assert [line[0] for line in lines] == ["ours, w/o LSA"]
+    assert lines[0][1].startswith("bonn-balloon2, bonn-crowd2")
+    assert lines[0][2] == "not there, in bonn or rgbd_bonn_dataset of the data folder"
 
 
 @pytest.mark.parametrize(

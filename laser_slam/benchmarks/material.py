@@ -56,7 +56,10 @@ class Material:
             for path in found:
                 if path.exists():
                     return path
-        raise DatasetError(f"no {' or '.join(spec.at)} in the data folder")
+        folders = [place.rpartition("/")[0] for place in spec.at if "/" in place] or spec.at
+        raise DatasetError(
+            f"not there, in {' or '.join(dict.fromkeys(folders))} of the data folder"
+        )
 
 
 def _make(spec: SequenceSpec, source: object) -> Dataset:
