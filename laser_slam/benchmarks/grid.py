@@ -18,6 +18,7 @@ from laser_slam.benchmarks.table import Block, Column, Table
 from laser_slam.evaluation import SequenceScores, failed_sequence, mean_score
 
 NOT_ASKED = "not asked for"
+PART = "only a part is there: "
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,8 @@ def fill_grids(table: Table, outcomes: Sequence[Outcome]) -> list[Grid]:
     """Put outcomes into the columns of a table.
 
     A mean is over the sequences that have the number, and says over how many; each of the others
-    is in the cell's reasons. Blocks of which no sequence was asked for are left out.
+    is in the cell's reasons. So is one of which only a part is there: no mean has it in it.
+    Blocks of which no sequence was asked for are left out.
     """
     names = list(dict.fromkeys(outcome.setting for outcome in outcomes))
     by_place = {(outcome.setting, outcome.sequence): outcome for outcome in outcomes}
@@ -122,14 +124,15 @@ def _cell(column: Column, members: Sequence[str], outcomes: Sequence[Outcome | N
     for name, outcome in zip(members, outcomes, strict=True):
         scores: Scores = {} if outcome is None else outcome.scores
         value = look_up(scores, measure)
-        if value is None:
+        part = None if outcome is None else outcome.part
+        if value is None or (part is not None and len(members) > 1):
             reasons[name] = _why(outcome, measure)
             rows.append(failed_sequence(name, reasons[name]))
         else:
             found = {column.measure: value * measure.factor}
             rows.append(SequenceScores(name, found, weight(scores, measure)))
-            if outcome is not None and outcome.part is not None:
-                parts[name] = outcome.part
+            if part is not None:
+                parts[name] = part
     mean = mean_score(rows, column.measure, is_weighted=True)
     return Cell(mean.value, mean.num, mean.num_sequences, measure.digits, reasons, parts)
 
@@ -137,6 +140,8 @@ def _cell(column: Column, members: Sequence[str], outcomes: Sequence[Outcome | N
 def _why(outcome: Outcome | None, measure: Measure) -> str:
     if outcome is None:
         return NOT_ASKED
+    if look_up(outcome.scores, measure) is not None:
+        return f"{PART}{outcome.part}"
     return outcome.reason or why_missing(outcome.scores, measure)
 
 

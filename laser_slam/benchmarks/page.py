@@ -38,7 +38,7 @@ the choices of the LASER paper and of its code.
 
 Rows whose source is "this run" were run by the command, all others are as their source has
 published them. A mean says over how many sequences it is where some have no number; a number with *
-is over a part of a sequence. Why, stands below the table.
+is over a part of a sequence, and in no mean. Why, stands below the table.
 """
 
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table as Drawn
 from rich.text import Text
 
-from laser_slam.benchmarks.grid import NOT_ASKED, Grid
+from laser_slam.benchmarks.grid import NOT_ASKED, PART, Grid
 from laser_slam.benchmarks.runner import Outcome
 
 OURS = "this run"
@@ -96,7 +96,7 @@ def list_missing(
     yield from _by_reason(outcomes)
     parts = {(one.sequence, one.part): None for one in outcomes if one.part and not one.reason}
     for sequence, part in parts:
-        yield "*", sequence, f"only a part is there: {part}"
+        yield "*", sequence, f"{PART}{part}"
     yield from _by_measure(grids, {(one.setting, one.sequence) for one in outcomes if one.reason})
 
 
@@ -109,7 +109,7 @@ def _by_measure(
         for row in (row for row in grid.rows if row.source is None):
             for column, cell in zip(grid.columns, row.cells, strict=True):
                 for sequence, why in cell.reasons.items():
-                    if (row.setting, sequence) not in failed and why:
+                    if (row.setting, sequence) not in failed and why and not why.startswith(PART):
                         what = why if why == NOT_ASKED else f"{column.measure}: {why}"
                         found.setdefault((row.setting, what), {})[sequence] = None
     lines: dict[tuple[str, str], list[str]] = {}
