@@ -8,18 +8,25 @@ The values are the same on every machine; ``fingerprints`` of the manifests say 
 
 import json
 import math
+import os
 import re
 import zlib
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 import torch
 from numpy.typing import NDArray
 
 Array = NDArray[np.float32]
 
 DATA = Path(__file__).parent / "data" / "golden"
+EVERY_TAP = os.environ.get("LASER_SLAM_GOLDEN", "")
+needs_every_tap = pytest.mark.skipif(
+    not EVERY_TAP, reason="LASER_SLAM_GOLDEN is not set to the folder of all taps"
+)
 TOLERANCE = 2e-5  # of the largest magnitude
 STREAM = 0.03  # of what feeds a layer norm
 CENTRE = np.float32(4 * 65535 // 2)  # of a sum of four
@@ -85,6 +92,10 @@ def load_case(model: str, name: str, part: str = "case", root: Path = DATA) -> C
     return Case(torch.from_numpy(images), strides[0], expected, meta["batch"], strides[1])
 
 
+def load_every_tap(model: str, name: str) -> Case:
+    return load_case(model, name, root=Path(EVERY_TAP))
+
+
 def load_functions() -> dict[str, Array]:
     """Return inputs and outputs of single functions."""
     with np.load(DATA / "functions" / "functions.npz", allow_pickle=False) as file:
@@ -100,6 +111,29 @@ def relative_difference(found: torch.Tensor, expected: Array) -> float:
     return float(np.abs(difference).max() / np.abs(theirs[np.isfinite(theirs)]).max())
 
 
+def mean_error(found: torch.Tensor, expected: torch.Tensor) -> float:
+    return float((found - expected).abs().mean() / expected.abs().mean())
+
+
+def differences(found: Any, expected: Any) -> dict[str, float]:
+    """Compare all that two predictions, named tuples, say."""
+    pairs = zip(found._fields, found, expected, strict=True)
+    return {name: relative_difference(ours, theirs.numpy()) for name, ours, theirs in pairs}
+
+
+def assert_same(found: Any, expected: Any, tolerance: float = 1e-5) -> None:
+    which = differences(found, expected)
+    assert all(value < tolerance for value in which.values()), which
+
+
+def assert_small(
+    which: dict[str, float], num: Container[int], tolerance: float = TOLERANCE
+) -> None:
+    """Hold all differences to the original to a tolerance; how many there are to ``num``."""
+    assert len(which) in num, sorted(which)
+    assert all(value < tolerance for value in which.values()), which
+
+
 def make_tensors(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:
     return {name: torch.from_numpy(make_weights(name, shape)) for name, shape in shapes.items()}
 
@@ -109,6 +143,15 @@ def fill(module: torch.nn.Module, prefix: str = "") -> None:
     with torch.no_grad():
         for name, parameter in module.named_parameters():
             parameter.copy_(torch.from_numpy(make_weights(prefix + name, list(parameter.shape))))
+
+
+def filled(make: Callable[[], torch.nn.Module]) -> Any:
+    """Build a network and draw its weights from their names."""
+    with torch.device("meta"):
+        network = make()
+    network.to_empty(device="cpu")
+    fill(network)
+    return network.requires_grad_(requires_grad=False).eval()
 
 
 def make_weights(name: str, shape: list[int]) -> Array:

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 from corridor import Corridor
+from golden import filled
 from numpy.typing import NDArray
 from perfect import settings
-from tiny import ENCODER, FRAMES, GIVEN, SIZE, TINY, K, filled, images, make_pi3x, make_vggt
+from tiny import ENCODER, FRAMES, GIVEN, SIZE, TINY, K, images, make_pi3x, make_vggt
 
 from laser_slam.backbones import NETWORKS, is_on_cpu
 from laser_slam.backbones.feedforward import NetworkBackbone

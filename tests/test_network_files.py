@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from golden import filled
 from perfect import settings
 from safetensors.torch import save_file
-from tiny import FRAMES, GIVEN, SIZE, TINY, K, filled, images
+from tiny import FRAMES, GIVEN, SIZE, TINY, K, images
 from torch import Tensor
 
 from laser_slam.backbones import BACKBONES, NETWORKS, make_backbone

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import golden
@@ -22,17 +21,13 @@ MINI = Pi3Config(
     EncoderConfig(64, 2, 2, num_registers=4), depth=4, num_heads=2, head_depth=2, camera_width=32
 )
 SHAPES = {"pi3": Pi3Config(), "mini/pi3": MINI}
-EVERY_TAP = os.environ.get("LASER_SLAM_GOLDEN", "")
 HEADS = ("point_head.", "conf_head.", "camera_head.")
 CONSTANTS = {"image_mean", "image_std"}
 
 
 def filled(config: Pi3Config) -> Pi3:
-    with torch.device("meta"):
-        network = Pi3(config)
-    network.to_empty(device="cpu")
-    golden.fill(network)
-    return network.eval()
+    network: Pi3 = golden.filled(lambda: Pi3(config))
+    return network
 
 
 @pytest.fixture(scope="module")
@@ -57,34 +52,25 @@ def predict(network: Pi3, images: Tensor) -> Pi3Output:
     return out
 
 
-def assert_same(found: Pi3Output, expected: Pi3Output, tolerance: float = 1e-5) -> None:
-    """Compare all that two predictions say, relative to the largest magnitude."""
-    for name, ours, theirs in zip(found._fields, found, expected, strict=True):
-        assert golden.relative_difference(ours, theirs.numpy()) < tolerance, name
-
-
 @pytest.mark.parametrize("name", ["a", "b"])
 def test_a_tiny_network_says_what_the_original_says(mini: Pi3, name: str) -> None:
-    differences = compare(mini, golden.load_case("mini/pi3", name, "network"))
-    assert len(differences) == 12
-    assert max(differences.values()) < golden.TOLERANCE, differences
+    case = golden.load_case("mini/pi3", name, "network")
+    golden.assert_small(compare(mini, case), {12})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list("abcde"))
 def test_the_full_network_says_what_the_original_says(full: Pi3, name: str) -> None:
-    differences = compare(full, golden.load_case("pi3", name, "network"))
-    assert len(differences) == 6
-    assert max(differences.values()) < golden.TOLERANCE, differences
+    case = golden.load_case("pi3", name, "network")
+    golden.assert_small(compare(full, case), {6})
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not EVERY_TAP, reason="LASER_SLAM_GOLDEN is not set to the folder of all taps")
+@golden.needs_every_tap
 @pytest.mark.parametrize("name", list("abcde"))
 def test_the_full_network_works_as_the_original_does(full: Pi3, name: str) -> None:
-    differences = compare(full, golden.load_case("pi3", name, root=Path(EVERY_TAP)))
-    assert len(differences) >= 13
-    assert max(differences.values()) < golden.TOLERANCE, differences
+    case = golden.load_every_tap("pi3", name)
+    golden.assert_small(compare(full, case), range(13, 100))
 
 
 @pytest.mark.parametrize("model", ["pi3", "mini/pi3"])
@@ -119,7 +105,7 @@ def test_outputs_do_not_depend_on_how_many_frames_the_heads_take_at_once(
         for chunk, calls in ((None, 1), (1, 3), (2, 2), (50, 1)):
             mini.chunk = chunk
             with tapped(mini) as seen:
-                assert_same(predict(mini, images), whole)
+                golden.assert_same(predict(mini, images), whole)
             assert len(seen["point_hidden"]) == len(seen["camera_hidden"]) == calls
     finally:
         mini.chunk = None
@@ -129,14 +115,14 @@ def test_windows_of_a_batch_do_not_see_one_another(mini: Pi3) -> None:
     images = golden.load_case("mini/pi3", "b").windows
     alone = [predict(mini, window[None]) for window in images]
     both = Pi3Output(*(torch.cat([a, b]) for a, b in zip(*alone, strict=True)))
-    assert_same(predict(mini, images), both)
+    golden.assert_same(predict(mini, images), both)
 
 
 def test_no_frame_is_the_first(mini: Pi3, images: Tensor) -> None:
     out = predict(mini, images)
     for order in ([0, 2, 1], [2, 0, 1]):
         moved = Pi3Output(*(value[:, order] for value in out))
-        assert_same(predict(mini, images[:, order]), moved)
+        golden.assert_same(predict(mini, images[:, order]), moved)
 
 
 def test_frames_of_a_window_see_one_another_and_tokens_do_not(mini: Pi3, images: Tensor) -> None:
@@ -177,10 +163,6 @@ def test_images_that_are_no_whole_patches_are_refused(mini: Pi3) -> None:
         predict(mini, torch.zeros(1, 2, 3, 60, 70))
 
 
-def mean_error(found: Tensor, expected: Tensor) -> float:
-    return float((found - expected).abs().mean() / expected.abs().mean())
-
-
 def halve(network: Pi3) -> Pi3:
     for name, child in network.named_children():
         if f"{name}." not in HEADS:
@@ -197,7 +179,7 @@ def test_half_precision_stays_close_and_heads_stay_whole(
     network = halve(filled(MINI)) if how == "weights" else mini
     with torch.autocast("cpu", torch.bfloat16, enabled=how == "autocast"), tapped(network) as seen:
         found = predict(network, images)
-    errors = [mean_error(ours, theirs) for ours, theirs in zip(found, expected, strict=True)]
+    errors = [golden.mean_error(ours, theirs) for ours, theirs in zip(found, expected, strict=True)]
     assert all(1e-4 < error < 0.03 for error in errors), errors
     assert all(value.dtype == torch.float32 for value in found)
     assert seen["dec0_qkv"][0].dtype == seen["point_hidden"][0].dtype == torch.bfloat16
@@ -245,7 +227,7 @@ def test_a_checkpoint_is_loaded_with_encoder_and_decoders_in_the_wanted_precisio
     assert not network.training
     assert not any(parameter.requires_grad for parameter in network.parameters())
     found, expected = predict(network, images), predict(filled(MINI), images)
-    assert mean_error(found.local_points, expected.local_points) < 0.03
+    assert golden.mean_error(found.local_points, expected.local_points) < 0.03
 
 
 def test_a_checkpoint_for_images_normalised_otherwise_is_refused(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +31,6 @@ MINI = Pi3XConfig(
     injected_after=(1, 3),
 )
 TOLERANCE = 3e-5  # of the largest magnitude
-EVERY_TAP = os.environ.get("LASER_SLAM_GOLDEN", "")
 HEADS = ("point_head.", "conf_head.", "camera_head.", "metric_head.")
 CONSTANTS = {"image_mean", "image_std"}
 BRANCH = ("depth_encoder.", "depth_emb", "ray_embed.", "pose_inject_blk.")
@@ -40,11 +38,8 @@ KINDS = ("depths", "intrinsics", "world_from_cam")
 
 
 def filled(config: Pi3XConfig) -> Pi3X:
-    with torch.device("meta"):
-        network = Pi3X(config)
-    network.to_empty(device="cpu")
-    golden.fill(network)
-    return network.eval()
+    network: Pi3X = golden.filled(lambda: Pi3X(config))
+    return network
 
 
 @pytest.fixture(scope="module")
@@ -74,31 +69,19 @@ def predict(network: Pi3X, images: Tensor, told: Conditions | None = None) -> Pi
     return out
 
 
-def differences(found: Pi3XOutput, expected: Pi3XOutput) -> dict[str, float]:
-    pairs = zip(found._fields, found, expected, strict=True)
-    return {name: golden.relative_difference(a, b.numpy()) for name, a, b in pairs}
-
-
-def assert_same(found: Pi3XOutput, expected: Pi3XOutput, tolerance: float = 1e-5) -> None:
-    """Compare all that two predictions say, relative to the largest magnitude."""
-    assert max(differences(found, expected).values()) < tolerance, differences(found, expected)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list("abcg"))
 def test_the_full_network_says_what_the_original_says(full: Pi3X, name: str) -> None:
-    differences = compare(full, golden.load_case("pi3x", name, "network"))
-    assert len(differences) == 8
-    assert max(differences.values()) < TOLERANCE, differences
+    case = golden.load_case("pi3x", name, "network")
+    golden.assert_small(compare(full, case), {8}, TOLERANCE)
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not EVERY_TAP, reason="LASER_SLAM_GOLDEN is not set to the folder of all taps")
+@golden.needs_every_tap
 @pytest.mark.parametrize("name", list("abcg"))
 def test_the_full_network_works_as_the_original_does(full: Pi3X, name: str) -> None:
-    differences = compare(full, golden.load_case("pi3x", name, root=Path(EVERY_TAP)))
-    assert len(differences) == (23 if name == "g" else 20)
-    assert max(differences.values()) < TOLERANCE, differences
+    case = golden.load_every_tap("pi3x", name)
+    golden.assert_small(compare(full, case), {23 if name == "g" else 20}, TOLERANCE)
 
 
 @pytest.mark.parametrize("takes_conditions", [True, False])
@@ -120,7 +103,7 @@ def test_outputs_do_not_depend_on_how_many_frames_the_heads_take_at_once(
         for chunk, calls in ((None, 1), (1, 3), (2, 2)):
             mini.chunk = chunk
             with tapped(mini) as seen:
-                assert_same(predict(mini, images), whole)
+                golden.assert_same(predict(mini, images), whole)
             assert len(seen["point_up2"]) == calls
     finally:
         mini.chunk = None
@@ -139,7 +122,7 @@ def test_windows_of_a_batch_do_not_see_one_another(
         torch.cat([intrinsics, intrinsics]),
         torch.cat([poses, poses[:, [0, 2, 1]]]),
     )
-    assert_same(predict(mini, torch.cat(windows), known), both)
+    golden.assert_same(predict(mini, torch.cat(windows), known), both)
 
 
 @pytest.mark.parametrize("is_told", [False, True])
@@ -152,7 +135,7 @@ def test_no_frame_is_the_first_but_for_the_axes_of_poses_that_are_told(
     known_moved = Conditions(*(part[:, order] for part in parts)) if is_told else None
     out = predict(mini, images, known)
     moved = Pi3XOutput(*(value[:, order] if value.ndim > 1 else value for value in out))
-    assert_same(predict(mini, images[:, order], known_moved), moved)
+    golden.assert_same(predict(mini, images[:, order], known_moved), moved)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -161,10 +144,10 @@ def test_each_kind_of_condition_is_heard_by_itself(
 ) -> None:
     free = predict(mini, images)
     heard = predict(mini, images, Conditions(**{kind: getattr(told, kind)}))
-    found = differences(heard, free)
+    found = golden.differences(heard, free)
     assert found.pop("tokens") == 0
     assert min(found.values()) > 1e-4
-    assert_same(predict(mini, images, Conditions()), free, tolerance=1e-6)
+    golden.assert_same(predict(mini, images, Conditions()), free, tolerance=1e-6)
 
 
 def test_units_of_depths_and_poses_and_axes_of_the_world_do_not_matter(
@@ -175,13 +158,13 @@ def test_units_of_depths_and_poses_and_axes_of_the_world_do_not_matter(
     poses = torch.linalg.inv(world_from_cam[:, 1:2]) @ world_from_cam
     poses[..., :3, 3] *= 100
     same = Conditions(depths * 100, intrinsics, poses)
-    assert_same(predict(mini, images, same), out, tolerance=1e-4)
+    golden.assert_same(predict(mini, images, same), out, tolerance=1e-4)
 
 
 def test_the_pose_of_one_frame_says_nothing(mini: Pi3X, images: Tensor) -> None:
     _, _, world_from_cam = make_told()
     heard = predict(mini, images[:, 2:], Conditions(world_from_cam=world_from_cam[:, 2:]))
-    assert_same(heard, predict(mini, images[:, 2:]), tolerance=1e-6)
+    golden.assert_same(heard, predict(mini, images[:, 2:]), tolerance=1e-6)
 
 
 @pytest.mark.parametrize("num_frames", [1, 20])
@@ -193,10 +176,6 @@ def test_windows_may_be_of_any_length(mini: Pi3X, num_frames: int) -> None:
     assert out.metric.shape == (1,)
     assert all(value.dtype == torch.float32 for value in out)
     assert bool((out.local_points[..., 2] > 0).all())
-
-
-def mean_error(found: Tensor, expected: Tensor) -> float:
-    return float((found - expected).abs().mean() / expected.abs().mean())
 
 
 def halve(network: Pi3X) -> Pi3X:
@@ -221,7 +200,7 @@ def test_half_precision_stays_close_and_heads_stay_whole(
     network = halve(filled(MINI)) if how == "weights" else mini
     with torch.autocast("cpu", torch.bfloat16, enabled=how == "autocast"), tapped(network) as seen:
         found = predict(network, images, known)
-    errors = [mean_error(ours, theirs) for ours, theirs in zip(found, expected, strict=True)]
+    errors = [golden.mean_error(ours, theirs) for ours, theirs in zip(found, expected, strict=True)]
     assert all(1e-5 < error < 0.03 for error in errors), errors
     assert all(value.dtype == torch.float32 for value in found)
     assert {seen[name][0].dtype for name in ("point_up0", "conf_up2", "metric_raw")} == {
@@ -271,7 +250,7 @@ def test_the_part_that_takes_conditions_may_be_left_out_on_demand(
     path = tmp_path / "model.safetensors"
     save_checkpoint(path, without=() if is_there else BRANCH)
     network = load_pi3x(str(path), config=replace(MINI, takes_conditions=False))
-    assert_same(predict(network, images), predict(mini, images), tolerance=1e-6)
+    golden.assert_same(predict(network, images), predict(mini, images), tolerance=1e-6)
     with pytest.raises(ValueError, match="takes_conditions=False"):
         predict(network, images, told)
 

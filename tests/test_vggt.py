@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,15 +30,11 @@ MINI = VggtConfig(
 )
 SHAPES = {"vggt": FULL, "mini/vggt": MINI}
 STEADY = ("depth", "depth_confidence", "tokens", "points", "points_confidence")
-EVERY_TAP = os.environ.get("LASER_SLAM_GOLDEN", "")
 
 
 def filled(config: VggtConfig) -> Vggt:
-    with torch.device("meta"):
-        network = Vggt(config)
-    network.to_empty(device="cpu")
-    golden.fill(network)
-    return network.eval()
+    network: Vggt = golden.filled(lambda: Vggt(config))
+    return network
 
 
 @pytest.fixture(scope="module")
@@ -64,40 +59,29 @@ def predict(network: Vggt, images: Tensor) -> VggtOutput:
     return out
 
 
-def assert_same(found: VggtOutput, expected: VggtOutput, tolerance: float = 1e-5) -> None:
-    """Compare all that two predictions say, relative to the largest magnitude."""
-    for name, ours, theirs in zip(found._fields, found, expected, strict=True):
-        assert ours is not None, name
-        assert theirs is not None, name
-        assert golden.relative_difference(ours, theirs.numpy()) < tolerance, name
-
-
 def select(out: VggtOutput, frames: list[int]) -> VggtOutput:
     return VggtOutput(*(value[:, frames] for value in out if value is not None))
 
 
 @pytest.mark.parametrize("name", ["a", "b"])
 def test_a_tiny_network_says_what_the_original_says(mini: Vggt, name: str) -> None:
-    differences = compare(mini, golden.load_case("mini/vggt", name, "network"))
-    assert len(differences) == 18
-    assert max(differences.values()) < golden.TOLERANCE, differences
+    case = golden.load_case("mini/vggt", name, "network")
+    golden.assert_small(compare(mini, case), {18})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list("abcdf"))
 def test_the_full_network_says_what_the_original_says(full: Vggt, name: str) -> None:
-    differences = compare(full, golden.load_case("vggt", name, "network"))
-    assert len(differences) == 7
-    assert max(differences.values()) < golden.TOLERANCE, differences
+    case = golden.load_case("vggt", name, "network")
+    golden.assert_small(compare(full, case), {7})
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not EVERY_TAP, reason="LASER_SLAM_GOLDEN is not set to the folder of all taps")
+@golden.needs_every_tap
 @pytest.mark.parametrize("name", list("abcdf"))
 def test_the_full_network_works_as_the_original_does(full: Vggt, name: str) -> None:
-    differences = compare(full, golden.load_case("vggt", name, root=Path(EVERY_TAP)))
-    assert len(differences) >= 28
-    assert max(differences.values()) < golden.TOLERANCE, differences
+    case = golden.load_every_tap("vggt", name)
+    golden.assert_small(compare(full, case), range(28, 100))
 
 
 @pytest.mark.parametrize("model", ["vggt", "mini/vggt"])
@@ -122,7 +106,7 @@ def test_maps_do_not_depend_on_how_many_frames_are_taken_at_once(
             mini.config = replace(MINI, chunk=chunk)
             _, seen = run_tapped(mini, images)
             assert len(seen["depth_conv1"]) == {None: 1, 1: 3, 2: 2}[chunk]
-            assert_same(predict(mini, images), whole)
+            golden.assert_same(predict(mini, images), whole)
     finally:
         mini.config = MINI
 
@@ -131,12 +115,12 @@ def test_windows_of_a_batch_do_not_see_one_another(mini: Vggt) -> None:
     images = golden.load_case("mini/vggt", "b").windows
     alone = [predict(mini, window[None]) for window in images]
     both = VggtOutput(*(torch.cat([a, b]) for a, b in zip(*alone, strict=True)))
-    assert_same(predict(mini, images), both)
+    golden.assert_same(predict(mini, images), both)
 
 
 def test_frames_after_the_first_are_exchangeable(mini: Vggt, images: Tensor) -> None:
     out = predict(mini, images)
-    assert_same(predict(mini, images[:, [0, 2, 1]]), select(out, [0, 2, 1]))
+    golden.assert_same(predict(mini, images[:, [0, 2, 1]]), select(out, [0, 2, 1]))
     moved = select(predict(mini, images[:, [1, 0, 2]]), [1, 0, 2])
     assert golden.relative_difference(moved.depth, out.depth.numpy()) > 1e-3
 
@@ -190,10 +174,6 @@ def test_images_that_are_no_whole_patches_are_refused(mini: Vggt) -> None:
         predict(mini, torch.zeros(1, 2, 3, 60, 70))
 
 
-def mean_error(found: Tensor, expected: Tensor) -> float:
-    return float((found - expected).abs().mean() / expected.abs().mean())
-
-
 @pytest.mark.parametrize("how", ["weights", "autocast"])
 def test_half_precision_stays_close_and_heads_stay_whole(
     mini: Vggt, images: Tensor, how: str
@@ -205,8 +185,8 @@ def test_half_precision_stays_close_and_heads_stay_whole(
         network.aggregator.to(torch.bfloat16)
     with torch.autocast("cpu", torch.bfloat16, enabled=how == "autocast"):
         found, seen = run_tapped(network, images)
-    errors = [mean_error(getattr(found, name), getattr(expected, name)) for name in STEADY]
-    errors.append(mean_error(seen["pose_enc_list"][0], exact["pose_enc_list"][0]))
+    errors = [golden.mean_error(getattr(found, name), getattr(expected, name)) for name in STEADY]
+    errors.append(golden.mean_error(seen["pose_enc_list"][0], exact["pose_enc_list"][0]))
     assert all(1e-4 < error < 0.02 for error in errors), errors
     assert all(value is not None and value.dtype == torch.float32 for value in found)
     assert seen["frame0"][0].dtype == (torch.bfloat16 if how == "weights" else torch.float32)
@@ -255,7 +235,8 @@ def test_a_checkpoint_is_loaded_with_the_aggregator_in_the_wanted_precision(
         assert torch.equal(value, tensors[key].to(value.dtype)), key
     assert not network.training
     assert not any(parameter.requires_grad for parameter in network.parameters())
-    assert mean_error(predict(network, images).depth, predict(filled(MINI), images).depth) < 0.02
+    found, expected = predict(network, images), predict(filled(MINI), images)
+    assert golden.mean_error(found.depth, expected.depth) < 0.02
 
 
 @pytest.mark.parametrize("key", ["camera_head.token_norm.weight", "aggregator.camera_token"])

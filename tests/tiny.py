@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import golden
 import numpy as np
-import torch
 from torch import nn
 
 from laser_slam.camera import intrinsics_from_fov
@@ -26,15 +22,6 @@ SIZE = (70, 126)
 FRAMES = np.arange(3, 7)
 K = intrinsics_from_fov(80.0, *SIZE)
 GIVEN = "backbone.pi3.intrinsics=given"  # random weights agree on no camera
-
-
-def filled(make: Callable[[], nn.Module]) -> Any:
-    """Build a network and draw its weights from their names."""
-    with torch.device("meta"):
-        network = make()
-    network.to_empty(device="cpu")
-    golden.fill(network)
-    return network.requires_grad_(requires_grad=False).eval()
 
 
 def make_pi3x() -> nn.Module:
