@@ -10,7 +10,7 @@ from pathlib import Path
 from laser_slam.backbones import FROM_TRUTH, REPLAY, make_backbone
 from laser_slam.backbones.base import Backbone
 from laser_slam.bookkeeping import Progress, StageClock, no_progress, run_log
-from laser_slam.config import BackboneConfig, Config, NetworkConfig
+from laser_slam.config import BackboneConfig, Config, DeviceConfig, NetworkConfig
 from laser_slam.datasets.base import Dataset
 from laser_slam.errors import ConfigError
 from laser_slam.export import write_tum
@@ -128,7 +128,7 @@ def _refuse_what_cannot_spread(config: Config) -> None:
 def _on_cpu(config: BackboneConfig) -> BackboneConfig:
     """Return the settings of a network for a machine that does not run it; else as they are."""
     section = getattr(config, config.name, None)
-    if not isinstance(section, NetworkConfig):
+    if not isinstance(section, DeviceConfig):
         return config
-    here = section.model_copy(update={"device": "cpu", "dtype": "auto"})
-    return config.model_copy(update={config.name: here})
+    update = {"device": "cpu", **({"dtype": "auto"} if isinstance(section, NetworkConfig) else {})}
+    return config.model_copy(update={config.name: section.model_copy(update=update)})
