@@ -18,7 +18,7 @@ from laser_slam.datasets.synthetic.drive import SyntheticDrive
 from laser_slam.errors import ConfigError, LaserSlamError, WeightsError
 from laser_slam.predicting import Fleet, Job
 from laser_slam.predicting.cluster import divide
-from laser_slam.predicting.fleet import Crew, Worker, _cause, _Task
+from laser_slam.predicting.fleet import Crew, _cause, _Task
 from laser_slam.store import load_prediction
 from laser_slam.types import Window
 
@@ -58,16 +58,22 @@ def begin(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """Predict stretch by stretch in this process: what any fleet must leave."""
-    folder = tmp_path_factory.mktemp("alone") / "windows"
-    source = job(folder).source
+def alone(tmp_path_factory: pytest.TempPathFactory, cluster: None) -> dict[str, bytes]:
+    """Predict stretch by stretch in one process: what any fleet must leave.
+
+    Twice, for code that a process has compiled itself rounds otherwise than what it finds
+    compiled, as the workers will.
+    """
+    source = job(tmp_path_factory.mktemp("alone") / "windows").source
     source.open()
-    worker, files = Worker(CONFIG.backbone), []
-    windows = list(source.cut())
-    for first in range(0, len(windows), 2):
-        files += worker.predict(windows[first : first + 2], source.rectifier.intrinsics)
-    return {f"{index:06d}.npz": content for index, content in enumerate(files)}
+    windows, files = list(source.cut()), []
+    for _ in range(2):
+        with Crew(ONE, CONFIG.backbone) as crew:
+            stretches = [windows[first : first + 2] for first in range(0, len(windows), 2)]
+            done = crew.predict(stretches, source.rectifier.intrinsics)
+            files = sorted((stretch[0].index, contents) for stretch, contents in done)
+    in_order = [content for _, contents in files for content in contents]
+    return {f"{index:06d}.npz": content for index, content in enumerate(in_order)}
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
