@@ -106,3 +106,18 @@ def poselib_camera(intrinsics: Array) -> dict[str, object]:
     """
     params = [intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]]
     return {"model": "PINHOLE", "width": 0, "height": 0, "params": params}
+
+
+def median_depth(
+    depth: NDArray[np.float32], confidence: NDArray[np.float32], min_confidence: float
+) -> float | None:
+    """Return the median depth of a window's confident pixels; None: there are none.
+
+    Args:
+        depth: (N, H, W) in any unit; every second row and column is looked at.
+        confidence: (N, H, W) in [0, 1].
+        min_confidence: that a pixel needs.
+    """
+    depth, confidence = depth[:, ::2, ::2], confidence[:, ::2, ::2]
+    known = depth[(confidence >= min_confidence) & (depth > 0) & np.isfinite(depth)]
+    return float(np.median(known)) if known.size else None

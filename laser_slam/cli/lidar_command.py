@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from laser_slam.cli.app import HELP_NAMES, QuietOption, RunOptions, app, command
-from laser_slam.cli.sources import source
-from laser_slam.errors import ConfigError
+from laser_slam.cli.sources import RootOption, open_kitti, source
 
 if TYPE_CHECKING:
     from laser_slam.lidar_reference import LidarDataset
@@ -71,17 +70,10 @@ def kitti_raw(
 def lidar_kitti(
     sequence: Annotated[str, typer.Argument(metavar="SEQ", help="Such as 03.")],
     options: LidarFlags,
-    root: Annotated[
-        Path | None,
-        typer.Option(envvar="LASER_SLAM_KITTI", help="Folder that holds 'sequences'."),
-    ] = None,
+    root: RootOption = None,
 ) -> None:
     """A sequence of KITTI odometry with its folder 'velodyne'."""
-    from laser_slam.datasets.kitti import ROOT_ADVICE, KittiOdometry
-
-    if root is None:
-        raise ConfigError(f"no KITTI folder; {ROOT_ADVICE}")
-    options.work(KittiOdometry(root, sequence))
+    options.work(open_kitti(sequence, root))
 
 
 @functools.partial(command, name="kitti-raw", group=lidar_app, options=LidarFlags)

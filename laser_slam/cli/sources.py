@@ -17,12 +17,28 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from laser_slam.datasets.kitti import KittiOdometry
+
 IntrinsicsOption = Annotated[
     str | None, typer.Option("--intrinsics", help="fx,fy,cx,cy in pixels of the images.")
 ]
 FovOption = Annotated[
     float | None, typer.Option("--fov", help="Horizontal field of view, degrees.")
 ]
+
+RootOption = Annotated[
+    Path | None,
+    typer.Option("--root", envvar="LASER_SLAM_KITTI", help="Folder that holds 'sequences'."),
+]
+
+
+def open_kitti(sequence: str, root: Path | None) -> KittiOdometry:
+    """Open a sequence of KITTI odometry below the folder that an option or a variable names."""
+    from laser_slam.datasets.kitti import ROOT_ADVICE, KittiOdometry
+
+    if root is None:
+        raise ConfigError(f"no KITTI folder; {ROOT_ADVICE}")
+    return KittiOdometry(root, sequence)
 
 
 def source(function: Callable[..., None], name: str | None = None) -> Callable[..., None]:
@@ -58,20 +74,10 @@ def demo(
 def kitti(
     sequence: Annotated[str, typer.Argument(metavar="SEQ", help="Such as 03.")],
     options: RunOptions,
-    root: Annotated[
-        Path | None,
-        typer.Option(envvar="LASER_SLAM_KITTI", help="Folder that holds 'sequences'."),
-    ] = None,
+    root: RootOption = None,
 ) -> None:
     """A sequence of KITTI odometry, scored where poses are there."""
-    from laser_slam.datasets.kitti import KittiOdometry
-
-    if root is None:
-        raise ConfigError(
-            "no KITTI folder; pass --root, or set LASER_SLAM_KITTI, to the folder that holds "
-            "'sequences'"
-        )
-    options.work(KittiOdometry(root, sequence), options.settings())
+    options.work(open_kitti(sequence, root), options.settings())
 
 
 @functools.partial(source, name="7scenes")

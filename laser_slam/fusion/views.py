@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from laser_slam.camera import median_depth
 from laser_slam.config import FusionConfig
 from laser_slam.fusion.consistency import consistent_depth
 from laser_slam.fusion.edges import drop_edges
@@ -37,18 +38,14 @@ class View(NamedTuple):
     center: Array
 
 
-def median_depth(submap: Submap, config: FusionConfig) -> float | None:
-    """Return the median depth of the window's confident pixels; None: there are none."""
+def _median_depth(submap: Submap, config: FusionConfig) -> float | None:
     prediction = submap.prediction
-    depth = prediction.depth[:, ::2, ::2]
-    confidence = prediction.confidence[:, ::2, ::2]
-    known = depth[(confidence >= config.min_confidence) & (depth > 0) & np.isfinite(depth)]
-    return float(np.median(known)) if known.size else None
+    return median_depth(prediction.depth, prediction.confidence, config.min_confidence)
 
 
 def automatic_voxel_size(submap: Submap, config: FusionConfig) -> float | None:
     """Return the edge of the voxels in world units that suits a submap; None: it has no depth."""
-    median = median_depth(submap, config)
+    median = _median_depth(submap, config)
     if median is None:
         return None
     return config.auto_voxel * median * submap.world_from_window.scale
@@ -56,7 +53,7 @@ def automatic_voxel_size(submap: Submap, config: FusionConfig) -> float | None:
 
 def owned_views(submap: Submap, config: FusionConfig) -> Iterator[View]:
     """Give the frames that a submap owns, without the pixels that would harm the map."""
-    prediction, median = submap.prediction, median_depth(submap, config)
+    prediction, median = submap.prediction, _median_depth(submap, config)
     if median is None:
         return
     for i in np.flatnonzero(submap.is_owned):

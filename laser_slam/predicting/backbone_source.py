@@ -18,8 +18,7 @@ from laser_slam.predicting.ahead import ahead
 from laser_slam.predicting.manifest import (
     Manifest,
     load_frames,
-    load_manifest,
-    refuse_others,
+    refuse_mixing,
     save_frames,
     settings_that_matter,
 )
@@ -87,9 +86,8 @@ class BackboneSource:
         """Make the folder, or take it up again."""
         if open_run_folder(self._folder, self._config, identify(self._dataset)):
             logger.info("resuming the run in %s", self._folder)
-        stored = load_manifest(self._folder)
+        stored = refuse_mixing(self._folder, self._manifest)
         if stored is not None:
-            refuse_others(self._folder, stored.made_by, self._manifest.made_by, "means")
             windows = stored.windows or []
             if windows and all(self.files.has(index) for index in range(len(windows))):
                 self._stored = windows

@@ -130,6 +130,25 @@ def refuse_others(
         )
 
 
+def refuse_mixing(folder: Path, manifest: Manifest) -> Manifest | None:
+    """Refuse to go on in a folder with predictions that were made by other means.
+
+    Args:
+        folder: of the run.
+        manifest: of the predictions that would join those that are there.
+
+    Returns:
+        The manifest that is there; None: there is none.
+
+    Raises:
+        RunFolderError: names what differs.
+    """
+    stored = load_manifest(folder)
+    if stored is not None:
+        refuse_others(folder, stored.made_by, manifest.made_by, "means")
+    return stored
+
+
 def read_identity(folder: Path) -> dict[str, Any]:
     """Read which input the predictions in a folder are of.
 

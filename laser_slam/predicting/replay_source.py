@@ -13,9 +13,9 @@ from laser_slam.datasets.base import Dataset
 from laser_slam.errors import RunFolderError
 from laser_slam.predicting.manifest import (
     load_frames,
-    load_manifest,
     load_predictions,
     read_identity,
+    refuse_mixing,
     refuse_others,
     save_frames,
     settings_that_matter,
@@ -76,9 +76,7 @@ class ReplaySource:
         refuse_others(self._origin, read_identity(self._origin), sequence, "images")
         if open_run_folder(self._folder, self._config, sequence):
             logger.info("resuming the run in %s", self._folder)
-        stored = load_manifest(self._folder)
-        if stored is not None:
-            refuse_others(self._folder, stored.made_by, self._manifest.made_by, "means")
+        refuse_mixing(self._folder, self._manifest)
 
     def calibrate(self) -> None:
         """Keep the calibration with which the windows were predicted."""

@@ -6,19 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.config import FusionConfig
-from laser_slam.types import Prediction, Submap
+from laser_slam.types import Submap
 
 Array = NDArray[np.float64]
 Points = tuple[NDArray[np.float32], NDArray[np.uint8]]
 
 _SPARES = 2  # times as many pixels are drawn as are needed, for those at edges
-
-
-def median_depth(prediction: Prediction, fusion: FusionConfig) -> float | None:
-    """Return the median depth of a window's confident pixels, in window units; None: no depth."""
-    depth = prediction.depth[:, ::2, ::2]
-    known = depth[(prediction.confidence[:, ::2, ::2] >= fusion.min_confidence) & (depth > 0)]
-    return float(np.median(known)) if known.size else None
 
 
 def sample_points(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from laser_slam.camera import median_depth
 from laser_slam.config import FusionConfig, ViewerConfig
 from laser_slam.dependencies import import_rerun
 from laser_slam.sim3 import Sim3, rotation_log
@@ -15,7 +16,7 @@ from laser_slam.viewer import arrangement as at
 from laser_slam.viewer.base import CandidateRecord
 from laser_slam.viewer.frames import FrameLogger
 from laser_slam.viewer.pictures import class_colors
-from laser_slam.viewer.points import PointBudget, Points, median_depth, sample_points
+from laser_slam.viewer.points import PointBudget, Points, sample_points
 from laser_slam.viewer.sinks import Sink
 
 Array = NDArray[np.float64]
@@ -65,7 +66,8 @@ class RerunViewer:
         rows = np.flatnonzero(submap.is_owned & (frames > max(self._centers, default=-1)))
         if not len(rows):
             rows = np.array([len(frames) - 1])
-        unit = median_depth(submap.prediction, self._fusion)
+        seen = submap.prediction
+        unit = median_depth(seen.depth, seen.confidence, self._fusion.min_confidence)
         self._units.append(unit or (self._units[-1] if self._units else 1.0))
         for row in rows:
             center = submap.prediction.window_from_cam[row, :3, 3]
