@@ -167,7 +167,7 @@ FAULTS: dict[str, tuple[str, Spoil, str]] = {
     "waymo: a camera of another shape": (
         "waymo",
         lambda folder: spoil_camera(folder / "00002_1.npz", cam2world=np.eye(3)),
-        r"00002_1.npz must hold intrinsics \(3, 3\) and cam2world \(4, 4\)",
+        r"00002_1.npz must hold intrinsics \(3, 3\), cam2world \(4, 4\) and, if at all, distortion",
     ),
     "kitti: no depth": (
         "kitti-depth",

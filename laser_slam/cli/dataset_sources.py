@@ -17,26 +17,52 @@ def _folder(example: str) -> typer.models.ArgumentInfo:
     return argument
 
 
+RectifyOption = Annotated[
+    bool,
+    typer.Option(
+        "--rectify",
+        help="Take the published lens distortion out, of images and depth. Published "
+        "evaluations leave it in.",
+    ),
+]
+
+
 @functools.partial(source, name="tum-rgbd")
 def tum_rgbd(
-    folder: Annotated[Path, _folder("rgbd_dataset_freiburg1_desk")], options: RunOptions
+    folder: Annotated[Path, _folder("rgbd_dataset_freiburg1_desk, or the rgb_90 in it")],
+    options: RunOptions,
+    rectify: RectifyOption = False,
 ) -> None:
     """A sequence of TUM RGB-D, scored against its poses and depth."""
     from laser_slam.datasets.tum_rgbd import TumRgbd
 
-    options.work(TumRgbd(folder), options.settings())
+    options.work(TumRgbd(folder, rectify=rectify), options.settings())
 
 
 @source
-def bonn(folder: Annotated[Path, _folder("rgbd_bonn_balloon2")], options: RunOptions) -> None:
+def bonn(
+    folder: Annotated[Path, _folder("rgbd_bonn_balloon2, or the rgb_110 in it")],
+    options: RunOptions,
+    by_rank: Annotated[
+        bool,
+        typer.Option(
+            "--by-rank",
+            help="Pair images and depth maps by their order, not by time, as published "
+            "evaluations do.",
+        ),
+    ] = False,
+    rectify: RectifyOption = False,
+) -> None:
     """A sequence of Bonn RGB-D Dynamic, scored against its poses and depth."""
     from laser_slam.datasets.bonn import Bonn
 
-    options.work(Bonn(folder), options.settings())
+    options.work(Bonn(folder, by_rank=by_rank, rectify=rectify), options.settings())
 
 
 @source
-def scannet(folder: Annotated[Path, _folder("scene0707_00")], options: RunOptions) -> None:
+def scannet(
+    folder: Annotated[Path, _folder("scene0707_00, or the color_90 in it")], options: RunOptions
+) -> None:
     """A scene of ScanNet, exported from its .sens file, scored against its poses and depth."""
     from laser_slam.datasets.scannet import ScanNet
 
@@ -64,11 +90,12 @@ def waymo(
     folder: Annotated[Path, _folder("segment-..._with_camera_labels.tfrecord, converted")],
     options: RunOptions,
     camera: Annotated[int, typer.Option(help="1 to 5; 1: front.")] = 1,
+    rectify: RectifyOption = False,
 ) -> None:
     """A converted segment of the Waymo Open Dataset, scored against its poses and LiDAR."""
     from laser_slam.datasets.waymo import Waymo
 
-    options.work(Waymo(folder, camera=camera), options.settings())
+    options.work(Waymo(folder, camera=camera, rectify=rectify), options.settings())
 
 
 @functools.partial(source, name="kitti-depth")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +12,20 @@ from numpy.typing import NDArray
 
 from laser_slam.camera import intrinsics_matrix
 from laser_slam.datasets.decoding import read_depth
-from laser_slam.datasets.listed import Lens, ListedSequence, Shot
-from laser_slam.datasets.tum_rgbd import AGAIN, SIZE, UNITS_PER_M, read_shots
+from laser_slam.datasets.lens import Lens
+from laser_slam.datasets.listed import ListedSequence, Shot
+from laser_slam.datasets.timed_lists import AGAIN, read_shots, sequence_folder
+from laser_slam.datasets.tum_rgbd import SIZE, UNITS_PER_M
+from laser_slam.errors import DatasetError
 from laser_slam.sim3 import orthonormal
 
 Array = NDArray[np.float64]
 
 LENS = Lens(
     intrinsics_matrix(542.822841, 542.576870, 315.593520, 237.756098),
-    "Bonn RGB-D Dynamic, published, lens distortion left in",
+    "Bonn RGB-D Dynamic, published",
     SIZE,
+    np.array([0.039903, -0.099343, -0.000730, -0.000144, 0.0]),
 )
 # The published calibration of the poses. The second one holds a scale of 1.059, which poses in
 # metres do not take: it belongs to the depth of the sensor.
@@ -43,7 +48,11 @@ class Bonn(ListedSequence):
     ``TURNED @ pose @ TURNED @ MARKERS_FROM_CAM``, of which only the rigid part is taken.
 
     Args:
-        folder: of one sequence, such as ``rgbd_bonn_balloon2``.
+        folder: of one sequence, such as ``rgbd_bonn_balloon2``; or the ``rgb_110`` in it that
+            published evaluations copy their images to.
+        by_rank: give the n-th image the n-th depth map in order of names, however far apart in
+            time, as published evaluations do; of an ``rgb_110``, out of ``depth_110``.
+        rectify: take the lens distortion out, of images and depth.
 
     Raises:
         DatasetError: no such sequence there, a list that is broken, or lists without common times.
@@ -51,14 +60,25 @@ class Bonn(ListedSequence):
 
     again = AGAIN
 
-    def __init__(self, folder: Path) -> None:
-        name = folder.resolve().name
+    def __init__(self, folder: Path, *, by_rank: bool = False, rectify: bool = False) -> None:
+        shots = [_of_camera(shot) for shot in read_shots(folder)]
         super().__init__(
-            f"bonn-{name.removeprefix('rgbd_bonn_')}",
-            [_of_camera(shot) for shot in read_shots(folder)],
+            f"bonn-{sequence_folder(folder).resolve().name.removeprefix('rgbd_bonn_')}",
+            _ranked(folder, shots) if by_rank else shots,
             LENS,
             partial(read_depth, units_per_m=UNITS_PER_M, advice=AGAIN),
+            rectify=rectify,
         )
+
+
+def _ranked(folder: Path, shots: list[Shot]) -> list[Shot]:
+    """Pair images and depth maps by their places in order of names."""
+    home, name = sequence_folder(folder), folder.resolve().name
+    depths = home / (name.replace("rgb", "depth") if home != folder else "depth")
+    paths = sorted(depths.glob("*.png"))
+    if not paths:
+        raise DatasetError(f"no depth maps in {depths}; {AGAIN}")
+    return [replace(shot, depth=path) for shot, path in zip_longest(shots, paths) if shot]
 
 
 def _of_camera(shot: Shot) -> Shot:

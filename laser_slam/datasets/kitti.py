@@ -30,6 +30,7 @@ CAMERAS = ("image_2", "image_0")  # left colour, then left grey
 DEPTH_UNITS_PER_M = 256.0
 ROOT_ADVICE = "pass --root, or set LASER_SLAM_KITTI, to the folder that holds 'sequences'"
 AGAIN = "download the sequence again"
+CALIBRATION = "unpack KITTI's data_odometry_calib.zip, which holds it"
 TR_ADVICE = "take calib.txt of KITTI's calibration download, which has it"
 logger = logging.getLogger(__name__)
 
@@ -242,7 +243,8 @@ def _read_lines(path: Path) -> list[str]:
     try:
         return path.read_text(encoding="utf-8").rstrip().splitlines()
     except OSError as error:
-        raise DatasetError(f"cannot read {path} ({error.strerror}); {AGAIN}") from error
+        advice = CALIBRATION if isinstance(error, FileNotFoundError) else AGAIN
+        raise DatasetError(f"cannot read {path} ({error.strerror}); {advice}") from error
     except UnicodeDecodeError as error:
         raise DatasetError(f"{path} is not a text file; {AGAIN}") from error
 

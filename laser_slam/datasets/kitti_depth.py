@@ -8,7 +8,8 @@ from pathlib import Path
 from laser_slam.datasets.decoding import read_depth
 from laser_slam.datasets.kitti import DEPTH_UNITS_PER_M
 from laser_slam.datasets.kitti_calibration import read_rows
-from laser_slam.datasets.listed import Lens, ListedSequence, Shot, numbered_files
+from laser_slam.datasets.lens import Lens
+from laser_slam.datasets.listed import ListedSequence, Shot, numbered_files
 from laser_slam.errors import DatasetError
 
 RATE_HZ = 10.0

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.camera import resize_intrinsics
 from laser_slam.datasets.decoding import (
     Stream,
     check_same_kind,
@@ -18,12 +17,11 @@ from laser_slam.datasets.decoding import (
     read_ahead,
     read_image,
 )
-from laser_slam.datasets.intrinsics import check_intrinsics
+from laser_slam.datasets.lens import Depth, Lens, Undistortion
 from laser_slam.errors import DatasetError
 from laser_slam.types import Frame, SequenceInfo, Trajectory
 
 Array = NDArray[np.float64]
-Depth = NDArray[np.float32]
 DepthReader = Callable[[Path, tuple[int, int]], Depth]
 """Reads a file as depth of (height, width): metres, NaN: unknown."""
 
@@ -45,50 +43,31 @@ class Shot:
     world_from_cam: Array | None = None
 
 
-@dataclass(frozen=True)
-class Lens:
-    """Published intrinsics.
-
-    Attributes:
-        intrinsics: (3, 3) in pixels of images of ``size``; None: unknown.
-        source: where they come from, or why they are unknown, in words.
-        size: (height, width) that they are for; None: that of the sequence's images.
-    """
-
-    intrinsics: Array | None
-    source: str
-    size: tuple[int, int] | None = None
-
-    def at(self, size: tuple[int, int]) -> Array | None:
-        """Return the (3, 3) intrinsics of images of (height, width) ``size``.
-
-        Raises:
-            DatasetError: no image of that size can have them.
-        """
-        if self.intrinsics is None:
-            return None
-        scaled = resize_intrinsics(self.intrinsics, self.size or size, size)
-        return check_intrinsics(scaled, size, self.source)
-
-
 class ListedSequence:
     """A data set whose images, depth maps and poses are files that were found beforehand.
 
     Args:
         name: short name of the sequence.
         shots: all frames, in order; times rise.
-        lens: intrinsics.
+        lens: intrinsics and lens distortion.
         read_depth: reads a depth map.
+        rectify: take the lens distortion out, of images and depth; else it stays in both.
 
     Raises:
         DatasetError: there is no frame, the images have several sizes, the first one cannot be
-            read, or the intrinsics are impossible.
+            read, or the intrinsics are impossible, or unknown and needed.
     """
 
     again = "unpack the sequence again"  # what to do about what is broken
 
     def __init__(
-        self, name: str, shots: Sequence[Shot], lens: Lens, read_depth: DepthReader
+        self,
+        name: str,
+        shots: Sequence[Shot],
+        lens: Lens,
+        read_depth: DepthReader,
+        *,
+        rectify: bool = False,
     ) -> None:
         if not shots:
             raise DatasetError(f"no frames in {name}; {self.again}")
@@ -97,8 +76,16 @@ class ListedSequence:
         self._read_depth = read_depth
         files = tuple(shot.image for shot in self._shots)
         size = check_same_kind(files, self.again).size
-        truth = _truth(self._shots)
-        self._info = SequenceInfo(name, size, len(files), lens.at(size), lens.source, truth, files)
+        self._undistortion = Undistortion(lens, size) if rectify else None
+        intrinsics, source = lens.at(size), lens.source
+        if self._undistortion is not None:
+            intrinsics = self._undistortion.intrinsics
+            files = () if self._undistortion.bends else files  # those are of another camera
+        if lens.distortion is not None:
+            source += f", lens distortion {'taken out' if rectify else 'left in'}"
+        self._info = SequenceInfo(
+            name, size, len(self._shots), intrinsics, source, _truth(self._shots), files
+        )
 
     @property
     def info(self) -> SequenceInfo:
@@ -111,7 +98,7 @@ class ListedSequence:
         Raises:
             DatasetError: the first image or more than half of all are unreadable.
         """
-        jobs = (partial(_read, index, shot) for index, shot in enumerate(self._shots))
+        jobs = (partial(self._read, index, shot) for index, shot in enumerate(self._shots))
         return give_up_if_unreadable(read_ahead(jobs), self._folder, len(self._shots))
 
     def true_depth(self, frame: int) -> Depth | None:
@@ -125,11 +112,14 @@ class ListedSequence:
             return None
         if not path.is_file():
             raise DatasetError(f"no depth map {path}; {self.again}")
-        return self._read_depth(path, self._info.size)
+        depth = self._read_depth(path, self._info.size)
+        return depth if self._undistortion is None else self._undistortion.depth(depth)
 
-
-def _read(index: int, shot: Shot) -> Frame:
-    return Frame(index, shot.time_s, read_image(shot.image))
+    def _read(self, index: int, shot: Shot) -> Frame:
+        image = read_image(shot.image)
+        if image is not None and self._undistortion is not None:
+            image = self._undistortion.image(image)
+        return Frame(index, shot.time_s, image)
 
 
 def _truth(shots: Sequence[Shot]) -> Trajectory | None:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from laser_slam.camera import intrinsics_matrix
 from laser_slam.datasets.decoding import read_depth, read_header
-from laser_slam.datasets.listed import Lens, ListedSequence, Shot, numbered_files, require
+from laser_slam.datasets.lens import Lens
+from laser_slam.datasets.listed import ListedSequence, Shot, numbered_files, require
 from laser_slam.datasets.poses import read_rows, rigid_or_none
 from laser_slam.errors import DatasetError
 

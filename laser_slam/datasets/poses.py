@@ -77,3 +77,18 @@ def read_rows(path: Path, advice: str) -> list[tuple[int, list[str]]]:
         raise DatasetError(f"cannot read {path} ({reason}); {advice}") from error
     split = ((number, line.split()) for number, line in enumerate(lines, start=1))
     return [(number, words) for number, words in split if words and not words[0].startswith("#")]
+
+
+def matrix_of_words(path: Path, number: int, words: list[str], advice: str) -> Array:
+    """Return the (4, 4) numbers, which need not be finite, of line ``number`` of a text file.
+
+    Raises:
+        DatasetError: it holds something else; ends with ``advice``.
+    """
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError:
+        numbers = np.empty(0)
+    if numbers.shape != (16,):
+        raise DatasetError(f"line {number} of {path} must hold 4x4 numbers; {advice}")
+    return numbers.reshape(4, 4)

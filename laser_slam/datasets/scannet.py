@@ -1,4 +1,4 @@
-"""ScanNet: rooms scanned with a depth camera, as the official reader exports its ``.sens``."""
+"""ScanNet: rooms scanned with a depth camera, as its ``.sens`` files are exported."""
 
 from __future__ import annotations
 
@@ -6,26 +6,42 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from laser_slam.datasets.decoding import read_depth, read_header
-from laser_slam.datasets.listed import (
-    Depth,
-    Lens,
-    ListedSequence,
-    Shot,
-    numbered_files,
-    require,
+from laser_slam.datasets.lens import Depth, Lens
+from laser_slam.datasets.listed import ListedSequence, Shot, numbered_files, require
+from laser_slam.datasets.poses import (
+    matrix_of_words,
+    read_matrix,
+    read_pose,
+    read_rows,
+    rigid_or_none,
 )
-from laser_slam.datasets.poses import read_matrix, read_pose
 from laser_slam.errors import DatasetError
 
+Array = NDArray[np.float64]
+
 FPS = 30.0
+PREPARED_STEP = 3  # of the frames that published evaluations copy
 UNITS_PER_M = 1000.0
+IMAGES = (".jpg", ".jpeg", ".png")
+PREPARED = "color_"  # begins the folder of those frames
+INFO_ROW = "m_calibrationColorIntrinsic"
 AGAIN = "export the scene's .sens file again"
+EXPORT = (
+    "export it with ScanNet's SensReader/python/reader.py: --export_color_images "
+    "--export_depth_images --export_poses --export_intrinsics"
+)
 
 
 class ScanNet(ListedSequence):
     """One scene: ``color/0.jpg``, ``depth/0.png``, ``pose/0.txt``, ``intrinsic/*.txt``.
+
+    That is what ScanNet's Python reader exports. What its C++ reader does is read as well
+    (``frame-000000.color.jpg``, ``.depth.pgm``, ``.pose.txt`` and ``_info.txt``), and the folder
+    of chosen frames that published evaluations copy: ``color_90/frame_0000.jpg`` with ``depth_90``
+    and ``pose_90.txt`` beside it, every third frame of the scene.
 
     Depth is 16 bits, in millimetres, 0: unknown, and smaller than the colour images (640x480 for
     1296x968): it is brought to their size by its nearest pixels, and taken as registered with
@@ -33,7 +49,7 @@ class ScanNet(ListedSequence):
     frames a second by the number in the name.
 
     Args:
-        folder: of one scene, such as ``scene0707_00``.
+        folder: of one scene, such as ``scene0707_00``; or its ``color_90``.
 
     Raises:
         DatasetError: no such scene there, images of several sizes, or a broken pose file.
@@ -42,27 +58,95 @@ class ScanNet(ListedSequence):
     again = AGAIN
 
     def __init__(self, folder: Path) -> None:
-        color = numbered_files(folder / "color", "", (".jpg", ".jpeg", ".png"))
-        require(color, "0.jpg", folder / "color", "give the folder of one exported scene")
-        depth = numbered_files(folder / "depth", "", (".png",))
-        shots = [
-            Shot(
-                number / FPS,
-                path,
-                depth.get(number),
-                read_pose(folder / "pose" / f"{path.stem}.txt", AGAIN),
-            )
-            for number, path in color.items()
-        ]
-        name = f"scannet-{folder.resolve().name}"
-        super().__init__(name, shots, _lens(folder), _read_scaled_depth)
+        named = folder.resolve()
+        scene = named
+        if named.name.startswith(PREPARED):
+            scene, shots = named.parent, _prepared(named)
+        elif _cpp_files(folder, "color", IMAGES):
+            shots = _exported_by_cpp(folder)
+        else:
+            shots = _exported(folder)
+        super().__init__(f"scannet-{scene.name}", shots, _lens(scene), _read_scaled_depth)
+
+
+def _exported(folder: Path) -> list[Shot]:
+    color = numbered_files(folder / "color", "", IMAGES)
+    require(color, "0.jpg", folder / "color", _advice(folder))
+    depth = numbered_files(folder / "depth", "", (".png",))
+    return [
+        Shot(
+            number / FPS,
+            path,
+            depth.get(number),
+            read_pose(folder / "pose" / f"{path.stem}.txt", AGAIN),
+        )
+        for number, path in color.items()
+    ]
+
+
+def _advice(folder: Path) -> str:
+    """Say what to give instead of a folder without ``color``."""
+    prepared = sorted(path for path in folder.glob(f"{PREPARED}*") if path.is_dir())
+    if prepared:
+        return f"give {prepared[0]} for the frames that were chosen"
+    for sens in sorted(folder.glob("*.sens")):
+        return f"there is {sens.name}: {EXPORT}"
+    return "give the folder of one exported scene"
+
+
+def _exported_by_cpp(folder: Path) -> list[Shot]:
+    depth = _cpp_files(folder, "depth", (".pgm", ".png"))
+    return [
+        Shot(
+            number / FPS,
+            path,
+            depth.get(number),
+            read_pose(path.with_name(f"{path.name.split('.')[0]}.pose.txt"), AGAIN),
+        )
+        for number, path in _cpp_files(folder, "color", IMAGES).items()
+    ]
+
+
+def _cpp_files(folder: Path, kind: str, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """List files such as ``frame-000000.color.jpg`` by their numbers."""
+    found = {
+        int(path.name.split(".")[0].removeprefix("frame-")): path
+        for path in folder.glob(f"frame-*.{kind}.*")
+        if path.suffix in suffixes and path.name.split(".")[0].removeprefix("frame-").isdecimal()
+    }
+    return {number: found[number] for number in sorted(found)}
+
+
+def _prepared(folder: Path) -> list[Shot]:
+    color = numbered_files(folder, "frame_", IMAGES)
+    require(color, "frame_0000.jpg", folder, "give the folder of one exported scene")
+    which = folder.name.removeprefix(PREPARED)
+    depth = numbered_files(folder.with_name(f"depth_{which}"), "frame_", (".png",))
+    poses = folder.with_name(f"pose_{which}.txt")
+    rows = read_rows(poses, AGAIN) if poses.is_file() else []
+    if rows and len(rows) <= max(color):
+        raise DatasetError(f"{poses} has {len(rows)} lines for {len(color)} images; {AGAIN}")
+    return [
+        Shot(
+            PREPARED_STEP * number / FPS,
+            path,
+            depth.get(number),
+            rigid_or_none(matrix_of_words(poses, *rows[number], AGAIN)) if rows else None,
+        )
+        for number, path in color.items()
+    ]
 
 
 def _lens(folder: Path) -> Lens:
-    path = folder / "intrinsic" / "intrinsic_color.txt"
-    if not path.is_file():
+    path, info = folder / "intrinsic" / "intrinsic_color.txt", folder / "_info.txt"
+    if path.is_file():
+        return Lens(read_matrix(path, 4, AGAIN)[:3, :3], f"{path.parent.name}/{path.name}")
+    if not info.is_file():
         return Lens(None, "unknown: no intrinsic/intrinsic_color.txt")
-    return Lens(read_matrix(path, 4, AGAIN)[:3, :3], f"{path.parent.name}/{path.name}")
+    for number, words in read_rows(info, AGAIN):
+        if words[0] == INFO_ROW:
+            return Lens(matrix_of_words(info, number, words[2:], AGAIN)[:3, :3], info.name)
+    raise DatasetError(f"{info} has no row {INFO_ROW}; {AGAIN}")
 
 
 def _read_scaled_depth(path: Path, size: tuple[int, int]) -> Depth:

@@ -8,14 +8,19 @@ from pathlib import Path
 
 from laser_slam.camera import intrinsics_matrix
 from laser_slam.datasets.decoding import read_depth
-from laser_slam.datasets.listed import Lens, ListedSequence, Shot
+from laser_slam.datasets.lens import Lens
+from laser_slam.datasets.listed import ListedSequence, Shot
 from laser_slam.datasets.poses import read_pose
 from laser_slam.errors import DatasetError
 
 FPS = 30.0
-LENS = Lens(  # of the official page
-    intrinsics_matrix(585.0, 585.0, 320.0, 240.0), "7-Scenes, nominal", (480, 640)
-)
+SIZE, CENTRE = (480, 640), (320.0, 240.0)
+RAW, MOVED = "depth.png", "depth.proj.png"  # of the depth camera; moved to the colour camera
+FOCALS_PX = {RAW: 585.0, MOVED: 525.0}  # of the official page; of the script that moves
+SOURCES = {
+    RAW: "7-Scenes, nominal of the depth camera",
+    MOVED: "7-Scenes, of the colour camera that .depth.proj.png was moved to",
+}
 UNITS_PER_M = 1000.0
 INVALID = (0, 65535)
 COLOR_NAME = re.compile(r"frame-(\d+)\.color\.(png|jpe?g)", re.IGNORECASE)
@@ -25,13 +30,20 @@ AGAIN = "unpack the sequence again"
 class SevenScenes(ListedSequence):
     """One sequence: ``frame-000000.color.png`` (or .jpg), ``.depth.png`` and ``.pose.txt`` each.
 
-    Depth is that of the depth camera, 16 bits, in millimetres; it is taken as registered with the
-    colour camera, which the release does not promise (off by some pixels). A frame whose pose is
-    missing, not finite or no rigid motion has no true pose. There are no times: 30 frames a
-    second by the number in the name, so frames that were left out leave a gap.
+    Depth is 16 bits, in millimetres. The official ``.depth.png`` is as the depth camera saw it,
+    and is taken as registered with the colour camera, which it is not: it is off by some pixels,
+    and its focal length is 585 pixels. Where ``.depth.proj.png`` lies beside, which published
+    evaluations make of it (SimpleRecon's script), that is read instead, for all frames: the same
+    depth as the colour camera sees it, 525 pixels.
+
+    The poses are the depth camera's. A frame whose pose is missing, not finite or no rigid motion
+    has no true pose. There are no times: 30 frames a second by the number in the name, so frames
+    that were left out leave a gap.
 
     Args:
-        folder: of one sequence, such as ``kitchen/seq-01``.
+        folder: of one sequence, such as ``redkitchen/seq-03``.
+        focal_px: focal length in pixels at 640x480, for another one; LASER's evaluation has
+            554.2562584220408, which is NRGBD's. None: that of the depth.
 
     Raises:
         DatasetError: no such images there, images of several sizes, or a pose file that does not
@@ -40,18 +52,28 @@ class SevenScenes(ListedSequence):
 
     again = AGAIN
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, focal_px: float | None = None) -> None:
         named = folder.resolve()
+        frames = _list_frames(folder)
+        is_moved = any(_beside(path, MOVED).is_file() for path in frames.values())
+        depth = MOVED if is_moved else RAW
         super().__init__(
             f"7scenes-{named.parent.name}-{named.name}",
-            [_shot(number, path) for number, path in _list_frames(folder).items()],
-            LENS,
+            [_shot(number, path, depth) for number, path in frames.items()],
+            _lens(depth, focal_px),
             partial(read_depth, units_per_m=UNITS_PER_M, advice=AGAIN, invalid=INVALID),
         )
 
 
-def _shot(number: int, color: Path) -> Shot:
-    depth = _beside(color, "depth.png")
+def _lens(depth: str, focal_px: float | None) -> Lens:
+    focal, source = FOCALS_PX[depth], SOURCES[depth]
+    if focal_px is not None:
+        focal, source = focal_px, f"given, with the depth of .{depth}"
+    return Lens(intrinsics_matrix(focal, focal, *CENTRE), source, SIZE)
+
+
+def _shot(number: int, color: Path, ending: str) -> Shot:
+    depth = _beside(color, ending)
     pose = read_pose(_beside(color, "pose.txt"), AGAIN)
     return Shot(number / FPS, color, depth if depth.is_file() else None, pose)
 
@@ -69,6 +91,9 @@ def _list_frames(folder: Path) -> dict[int, Path]:
     if not found:
         inside = sorted(path.name for path in folder.iterdir() if path.is_dir())
         listed = f" (folders there: {', '.join(inside[:20])})" if inside else ""
+        zipped = sorted(path.name for path in folder.glob("seq-*.zip"))
+        if zipped and not inside:
+            raise DatasetError(f"{folder} holds {zipped[0]}; unpack it, and give its folder")
         raise DatasetError(
             f"no images such as frame-000000.color.png in {folder}{listed}; "
             "give the folder of one 7-Scenes sequence"

@@ -7,14 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.datasets.listed import (
-    Depth,
-    Lens,
-    ListedSequence,
-    Shot,
-    numbered_files,
-    require,
-)
+from laser_slam.datasets.lens import Depth, Lens
+from laser_slam.datasets.listed import ListedSequence, Shot, numbered_files, require
 from laser_slam.datasets.poses import rigid_or_none
 from laser_slam.errors import DatasetError
 from laser_slam.sim3 import Sim3
