@@ -24,6 +24,9 @@ from laser_slam.sim3 import Sim3, rotation_exp, umeyama
 
 Array = NDArray[np.float64]
 DATA = os.environ.get("LASER_SLAM_DATA")
+needs_data = pytest.mark.skipif(
+    DATA is None, reason="LASER_SLAM_DATA does not name the data folder"
+)
 EVERYTHING = PointProtocol()
 ELSEWHERE = Sim3(7.0, rotation_exp(np.array([0.3, -1.0, 0.4])), np.array([4.0, -2.0, 9.0]))
 
@@ -122,9 +125,8 @@ def test_scores_agree_with_the_slow_version(seed: int) -> None:
     assert_same(evaluate_points(maps, EVERYTHING), slow_errors(maps))
 
 
-@pytest.mark.skipif(DATA is None, reason="LASER_SLAM_DATA does not name the data folder")
-def test_a_real_room_is_scored_as_the_slow_version_and_open3d_do() -> None:
-    """Points of three keyframes of the kitchen, thinned, with 1 % of noise along the rays."""
+def real_room(step: int) -> list[PointMap]:
+    """Take every so many-th pixel of three kitchen keyframes, 1 % of noise along the rays."""
     room = SevenScenes(Path(str(DATA)) / "7scenes/kitchen/seq-01")
     poses, intrinsics = room.info.truth, room.info.intrinsics
     assert poses is not None
@@ -134,7 +136,7 @@ def test_a_real_room_is_scored_as_the_slow_version_and_open3d_do() -> None:
     for frame in (0, 10, 20):
         depth = room.true_depth(frame)
         assert depth is not None
-        in_cam = unproject(depth, intrinsics)[8::24, 8::24]
+        in_cam = unproject(depth, intrinsics)[8::step, 8::step]
         world_from_cam = poses.world_from_cam[frame]
         noisy = in_cam * (1 + 0.01 * rng.normal(size=(*in_cam.shape[:2], 1)))
         truth, found = (
@@ -142,6 +144,12 @@ def test_a_real_room_is_scored_as_the_slow_version_and_open3d_do() -> None:
         )
         known = np.isfinite(truth).all(axis=-1)
         maps.append(PointMap(ELSEWHERE.apply(found[known][None]), truth[known][None]))
+    return maps
+
+
+@needs_data
+def test_a_real_room_is_scored_as_the_slow_version_does() -> None:
+    maps = real_room(24)
     mine = evaluate_points(maps, EVERYTHING)
     assert_same(mine, slow_errors(maps))
     assert mine.scale == pytest.approx(1 / ELSEWHERE.scale, rel=5e-3)
@@ -149,9 +157,14 @@ def test_a_real_room_is_scored_as_the_slow_version_and_open3d_do() -> None:
     assert mine.acc_mean_m < 0.03  # 1 % of 2 m, and the grid of a thinned cloud hides some
 
 
-def test_distances_agree_with_open3d() -> None:
+@needs_data
+def test_a_real_room_is_scored_as_open3d_does() -> None:
+    assert_agrees_with_open3d(real_room(4))
+
+
+def assert_agrees_with_open3d(maps: list[PointMap]) -> None:
+    """Compare with Open3D's own distances, after its own ICP."""
     open3d = import_open3d()
-    maps = noisy_maps()
     found, truth = (
         np.concatenate([part.reshape(-1, 3) for part in parts])
         for parts in zip(*((each.points, each.truth) for each in maps), strict=True)
@@ -165,12 +178,17 @@ def test_distances_agree_with_open3d() -> None:
     there, back = (
         np.asarray(one.compute_point_cloud_distance(other)) for one, other in (clouds, clouds[::-1])
     )
-    mine = evaluate_points(maps, EVERYTHING)
+    mine = evaluate_points(maps, PointProtocol(has_normals=False))
     assert mine.acc_mean_m == pytest.approx(there.mean(), abs=1e-6)
     assert mine.acc_median_m == pytest.approx(np.median(there), abs=1e-6)
     assert mine.comp_mean_m == pytest.approx(back.mean(), abs=1e-6)
     assert mine.comp_median_m == pytest.approx(np.median(back), abs=1e-6)
     assert mine.icp_fitness == pytest.approx(result.fitness, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_distances_agree_with_open3d(seed: int) -> None:
+    assert_agrees_with_open3d(noisy_maps(seed))
 
 
 # --- laws ----------------------------------------------------------------------------------------
@@ -261,15 +279,40 @@ def test_the_least_confident_two_fifths_are_left_out_outdoors() -> None:
     assert errors.nc_median is None
 
 
-def test_what_is_not_predicted_is_dropped_before_the_least_confident() -> None:
+@pytest.mark.parametrize("num_rows", [1, 5, 11])
+def test_what_is_not_predicted_is_never_dropped_for_its_confidence(num_rows: int) -> None:
+    """Two fifths of what is predicted go; whoever predicts only easy pixels keeps the gaps."""
     maps = noisy_maps(num=1)
-    maps[0].points[:2] = np.nan
+    maps[0].points[:num_rows] = np.nan
+    errors = evaluate_points(maps, OUTDOOR_POINTS)
+    assert errors.num_points == pytest.approx(0.6 * (12 - num_rows) * 14, abs=1)
+    assert errors.num_truth == errors.num_points + num_rows * 14
+    assert errors.coverage == pytest.approx(1 - num_rows / 12)
+
+
+def test_a_point_of_unknown_confidence_goes_first() -> None:
+    maps = noisy_maps(num=1)
     confidence = maps[0].confidence
     assert confidence is not None
-    confidence[2] = np.nan
+    confidence[2:5] = np.nan
+    maps[0].points[2:5] += 100.0
     errors = evaluate_points(maps, OUTDOOR_POINTS)
-    assert errors.num_points == errors.num_truth
-    assert errors.num_truth == pytest.approx(0.6 * 12 * 14, abs=1)
+    assert errors.num_points == errors.num_truth == pytest.approx(0.6 * 12 * 14, abs=1)
+    assert errors.chamfer_m is not None
+    assert errors.chamfer_m < 0.2
+
+
+def test_confidence_is_compared_over_all_frames_together() -> None:
+    """The frame that is sure of nothing loses all of its points, the other none of the best."""
+    sure, unsure = noisy_maps(num=2)
+    assert sure.confidence is not None
+    assert unsure.confidence is not None
+    sure.confidence[:] = np.linspace(0.8, 1.0, 12 * 14).reshape(12, 14)
+    unsure.confidence[:] = np.linspace(0.0, 0.4, 12 * 14).reshape(12, 14)
+    alone = evaluate_points([sure], PointProtocol(has_normals=False))
+    both = evaluate_points([sure, unsure], PointProtocol(dropped_share=0.5, has_normals=False))
+    assert both.num_points == 12 * 14
+    assert both.chamfer_m == pytest.approx(alone.chamfer_m, abs=1e-9)
 
 
 def test_dropping_by_confidence_needs_confidence() -> None:
@@ -285,6 +328,7 @@ def test_a_hole_in_the_prediction_costs_completeness_and_not_accuracy() -> None:
     holed = evaluate_points([PointMap(whole[0], truth[0])], EVERYTHING)
     assert holed.num_points == 12 * 14 - 16
     assert holed.num_truth == 12 * 14
+    assert holed.coverage == pytest.approx(1 - 16 / (12 * 14))
     assert holed.acc_mean_m == pytest.approx(0, abs=1e-9)
     assert holed.comp_mean_m is not None
     assert holed.comp_mean_m > 0.02
@@ -307,6 +351,26 @@ def test_the_deepest_fiftieth_of_all_pixels_is_not_compared_outdoors() -> None:
     left = comparable_depth(depth, OUTDOOR_POINTS)
     assert np.isfinite(left).sum() == pytest.approx(800, abs=1)
     assert np.nanmax(left) < np.sort(depth[depth > 0])[-199]
+
+
+def test_a_laser_that_sees_fewer_pixels_than_are_too_far_loses_none() -> None:
+    """The published limit is then at depth 0, and is not used."""
+    depth = np.zeros((100, 100), dtype=np.float32)
+    depth[50, :150] = 30.0
+    assert np.isfinite(comparable_depth(depth, OUTDOOR_POINTS)).sum() == 100
+
+
+def test_a_frame_without_any_prediction_counts_for_completeness() -> None:
+    maps = noisy_maps(num=2, noise=0.0)
+    whole = evaluate_points(maps, EVERYTHING)
+    lost = PointMap(np.full_like(maps[1].points, np.nan), maps[1].truth)
+    half = evaluate_points([maps[0], lost], EVERYTHING)
+    assert (half.num_frames, half.num_predicted, half.coverage) == (2, 1, 0.5)
+    assert (whole.num_frames, whole.num_predicted, whole.coverage) == (2, 2, 1.0)
+    assert half.num_truth == whole.num_truth
+    assert half.comp_mean_m is not None
+    assert whole.comp_mean_m is not None
+    assert half.comp_mean_m > whole.comp_mean_m
 
 
 def test_unknown_truth_is_not_compared() -> None:

@@ -169,6 +169,8 @@ def test_unknown_pixels_are_left_out_and_counted() -> None:
     errors = score([(depth, truth), (None, truth)])
     assert errors.num_pixels == 12
     assert errors.num_frames == 2
+    assert errors.num_predicted == 1
+    assert errors.num_true_pixels == 32
     assert errors.coverage == pytest.approx(12 / 32)
     assert errors.abs_rel == pytest.approx(0, abs=1e-7)
 

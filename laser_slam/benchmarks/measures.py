@@ -9,6 +9,8 @@ from typing import Any
 
 Scores = Mapping[str, Any]
 
+PROTOCOL_VERSION = 2  # rises when a protocol's numbers change, so that kept ones are not taken
+
 
 @dataclass(frozen=True)
 class Measure:
@@ -51,7 +53,12 @@ MEASURES = {
         for measure, path, digits, factor, is_higher_better in (
             ("abs_rel", "abs_rel", 3, 1.0, False),
             ("delta_percent", "delta_125", 1, 100.0, True),
+            ("pixels_percent", "coverage", 1, 100.0, True),
         )
+    },
+    **{
+        f"{name}_pixels_percent": Measure(f"points_{name}", "coverage", 1, 100.0, True)
+        for name in ("indoor", "outdoor")
     },
     **{
         f"{name}_{measure}": Measure(f"points_{name}", path, 3, 1.0, path.startswith("nc"))
@@ -76,18 +83,13 @@ def look_up(scores: Scores, measure: Measure) -> float | None:
     >>> look_up({"run": {"frames": {"read": 3}}}, MEASURES["frames"])
     3.0
     """
-    found: Any = scores.get(measure.protocol)
-    for key in measure.path.split("."):
-        found = found.get(key) if isinstance(found, Mapping) else None
-    is_number = isinstance(found, int | float) and not isinstance(found, bool)
-    return float(found) if is_number and math.isfinite(found) else None
+    return _number(scores.get(measure.protocol), measure.path)
 
 
 def weight(scores: Scores, measure: Measure) -> float:
-    """Return what a run weighs in a mean: its compared pixels where depth of a video is scored."""
-    found = scores.get(measure.protocol)
-    num = found.get("num_pixels") if isinstance(found, Mapping) else None
-    return float(num) if num else 1.0
+    """Return what a run weighs in a mean: a video's depth its pixels with truth, all else 1."""
+    num = _number(scores.get(measure.protocol), "num_true_pixels")
+    return num if num else 1.0
 
 
 def why_missing(scores: Scores, measure: Measure) -> str:
@@ -95,12 +97,40 @@ def why_missing(scores: Scores, measure: Measure) -> str:
     found = scores.get(measure.protocol)
     if not isinstance(found, Mapping):
         return f"{measure.protocol} was not worked out"
-    if found.get("reason"):
-        return str(found["reason"])
-    part = found.get(measure.path.split(".")[0])
-    if isinstance(part, Mapping) and part.get("reason"):
-        return str(part["reason"])
-    return _LACKS.get(measure.path.split(".")[0], "") if part is None else _TOO_SHORT
+    first = measure.path.split(".")[0]
+    part = found.get(first)
+    for place in (found, part):
+        if isinstance(place, Mapping) and place.get("reason"):
+            return str(place["reason"])
+    return _LACKS.get(first, f"the run says nothing of {first}") if part is None else _TOO_SHORT
+
+
+def remarks(scores: Scores) -> tuple[str, ...]:
+    """Say what the numbers of a run are not over: frames without a pose, frames without depth.
+
+    >>> remarks({"run": {"trajectory": {"num_frames": 40, "num_truth": 90}}})
+    ('50 of 90 frames with a true pose have none and are not scored',)
+    """
+    found = []
+    posed = (_number(scores.get("run"), f"trajectory.num_{of}") for of in ("frames", "truth"))
+    num, num_truth = (int(each or 0) for each in posed)
+    if num < num_truth:
+        found.append(
+            f"{num_truth - num} of {num_truth} frames with a true pose have none and are not scored"
+        )
+    for name, result in scores.items():
+        num, num_truth = (int(_number(result, f"num_{of}") or 0) for of in ("predicted", "frames"))
+        if num < num_truth:
+            found.append(f"{name}: {num_truth - num} of {num_truth} frames have no depth")
+    return tuple(found)
+
+
+def _number(result: Any, path: str) -> float | None:
+    """Return the finite number that stands at ``a.b.c`` of a protocol's result."""
+    for key in path.split("."):
+        result = result.get(key) if isinstance(result, Mapping) else None
+    is_number = isinstance(result, int | float) and not isinstance(result, bool)
+    return float(result) if is_number and math.isfinite(result) else None
 
 
 _TOO_SHORT = "too little of it for this score"

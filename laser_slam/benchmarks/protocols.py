@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from laser_slam.evaluation import (
     VIDEO_DEPTH_PROTOCOLS,
     PointMap,
     PointProtocol,
+    VideoDepthProtocol,
+    comparable_depth,
     evaluate_points,
     evaluate_video_depth,
 )
@@ -40,10 +43,16 @@ def _views(folder: Path) -> Iterator[DepthView]:
 
 
 class _Truth:
-    """A data set's true depth as the run's rectified camera sees it."""
+    """A data set's true depth as the run's rectified camera sees it.
 
-    def __init__(self, folder: Path, dataset: Dataset) -> None:
-        self._dataset, self._rectifier = dataset, None
+    Args:
+        folder: of the run.
+        dataset: that it was run on.
+        keep: chooses what of a map is compared, before anything is done to it.
+    """
+
+    def __init__(self, folder: Path, dataset: Dataset, keep: Callable[[Depth], Depth]) -> None:
+        self._dataset, self._keep, self._rectifier = dataset, keep, None
         path = folder / CALIBRATION
         if path.exists():
             calibration = load_calibration(path)
@@ -53,9 +62,10 @@ class _Truth:
     def depth(self, frame: int) -> Depth | None:
         """Return a frame's (H, W) z in metres; None: there is none."""
         truth = self._dataset.true_depth(frame)
-        if truth is None or self._rectifier is None:
-            return truth
-        return self._rectifier.depth(truth)
+        if truth is None:
+            return None
+        kept = self._keep(truth)
+        return kept if self._rectifier is None else self._rectifier.depth(kept)
 
     def intrinsics(self, size: tuple[int, int], seen: Array) -> Array:
         """Return the (3, 3) true ones for maps of (height, width), or ``seen``."""
@@ -65,49 +75,67 @@ class _Truth:
         return resize_intrinsics(info.intrinsics, info.size, size)
 
 
-def _video_depth(name: str) -> Protocol:
+def _video_depth(protocol: VideoDepthProtocol) -> Protocol:
     def score(folder: Path, dataset: Dataset) -> dict[str, Any]:
-        known = _Truth(folder, dataset)
-        num = dataset.info.num_frames or 0
+        known = _Truth(folder, dataset, lambda depth: depth)
 
         def pairs() -> Iterator[tuple[Depth | None, Depth]]:
-            views = _views(folder)
-            view = next(views, None)
-            for frame in range(num):
-                truth, depth = known.depth(frame), None
-                if view is not None and view.frame == frame:
-                    depth, view = view.depth, next(views, None)
+            for frame, view in _every_frame(folder, dataset):
+                truth = known.depth(frame)
                 if truth is not None:
-                    yield depth, truth
+                    yield None if view is None else view.depth, truth
 
-        return asdict(evaluate_video_depth(pairs, VIDEO_DEPTH_PROTOCOLS[name]))
+        return asdict(evaluate_video_depth(pairs, protocol))
 
     return score
 
 
 def _points(protocol: PointProtocol) -> Protocol:
     def score(folder: Path, dataset: Dataset) -> dict[str, Any]:
-        truth = dataset.info.truth
-        if truth is None:
+        if dataset.info.truth is None:
             return {"reason": "no true poses"}
-        poses = dict(zip(truth.frames.tolist(), truth.world_from_cam, strict=True))
-        known = _Truth(folder, dataset)
-
-        def maps() -> Iterator[PointMap]:
-            for view in _views(folder):
-                depth = known.depth(view.frame)
-                if depth is not None and view.frame in poses:
-                    size = (view.depth.shape[0], view.depth.shape[1])
-                    K = known.intrinsics(size, view.intrinsics)
-                    yield PointMap(
-                        _unproject(view.depth, view.intrinsics, view.world_from_cam),
-                        _unproject(_resized(depth, size), K, poses[view.frame]),
-                        view.confidence,
-                    )
-
-        return asdict(evaluate_points(maps(), protocol))
+        if next(_views(folder), None) is None:
+            return {"reason": "the run has no depth map"}
+        known = _Truth(folder, dataset, partial(comparable_depth, protocol=protocol))
+        return asdict(evaluate_points(_point_maps(folder, dataset, known), protocol))
 
     return score
+
+
+def _point_maps(folder: Path, dataset: Dataset, known: _Truth) -> Iterator[PointMap]:
+    """Give the points of every frame whose true depth and pose are known; NaN: not predicted."""
+    poses = _true_poses(dataset)
+    like = next(_views(folder))  # frames that the run has no view of are given in its size
+    size = (like.depth.shape[0], like.depth.shape[1])
+    for frame, view in _every_frame(folder, dataset):
+        depth = known.depth(frame) if frame in poses else None
+        if depth is None:
+            continue
+        K = known.intrinsics(size, (view or like).intrinsics)
+        truth = _unproject(_resized(depth, size), K, poses[frame])
+        if view is None:
+            yield PointMap(np.full_like(truth, np.nan), truth, np.zeros(size, np.float32))
+        else:
+            found = _unproject(view.depth, view.intrinsics, view.world_from_cam)
+            yield PointMap(found, truth, view.confidence)
+
+
+def _every_frame(folder: Path, dataset: Dataset) -> Iterator[tuple[int, DepthView | None]]:
+    """Give each frame of a data set with the run's view of it; None: it has none."""
+    views = _views(folder)
+    view = next(views, None)
+    for frame in range(dataset.info.num_frames or 0):
+        found = view if view is not None and view.frame == frame else None
+        yield frame, found
+        if found is not None:
+            view = next(views, None)
+
+
+def _true_poses(dataset: Dataset) -> dict[int, Array]:
+    truth = dataset.info.truth
+    if truth is None:
+        return {}
+    return dict(zip(truth.frames.tolist(), truth.world_from_cam, strict=True))
 
 
 def _resized(depth: Depth, size: tuple[int, int]) -> Depth:
@@ -129,7 +157,7 @@ def _unproject(depth: Depth, K: Array, world_from_cam: Array) -> Array:
 
 
 PROTOCOLS: dict[str, Protocol] = {
-    **{f"video_depth_{name}": _video_depth(name) for name in VIDEO_DEPTH_PROTOCOLS},
+    **{f"video_depth_{name}": _video_depth(each) for name, each in VIDEO_DEPTH_PROTOCOLS.items()},
     "points_indoor": _points(INDOOR_POINTS),
     "points_outdoor": _points(OUTDOOR_POINTS),
 }

@@ -2,20 +2,13 @@
 
 from laser_slam.evaluation.depth import DepthErrors, evaluate_depth
 from laser_slam.evaluation.means import (
-    KITTI_ODOMETRY,
     Mean,
     SequenceScores,
     failed_sequence,
-    kitti_means,
-    kitti_scores,
     mean_score,
-    point_scores,
-    pose_scores,
-    video_depth_scores,
 )
 from laser_slam.evaluation.points import (
     INDOOR_POINTS,
-    KEYFRAME_INTERVAL,
     OUTDOOR_POINTS,
     PointErrors,
     PointMap,
@@ -43,8 +36,6 @@ from laser_slam.evaluation.video_depth import (
 
 __all__ = [
     "INDOOR_POINTS",
-    "KEYFRAME_INTERVAL",
-    "KITTI_ODOMETRY",
     "OUTDOOR_POINTS",
     "VIDEO_DEPTH_PROTOCOLS",
     "DepthErrors",
@@ -67,12 +58,7 @@ __all__ = [
     "evaluate_video_depth",
     "failed_sequence",
     "kitti_errors",
-    "kitti_means",
-    "kitti_scores",
     "mean_score",
-    "point_scores",
-    "pose_scores",
     "relative_errors",
     "resize_depth",
-    "video_depth_scores",
 ]

@@ -42,6 +42,9 @@ class ScanDistances:
     A point is compared with every scan within ``REACH_M`` that has it in its vertical field of
     view, and keeps the smallest distance. What lies outside all of them, such as roofs, says
     nothing.
+
+    Attributes:
+        distances: (N,) metres, infinite beyond ``BEYOND_M``; NaN: not compared.
     """
 
     def __init__(self, points: Array) -> None:
@@ -51,8 +54,7 @@ class ScanDistances:
             points: (N, 3) of the cloud, in metres, in the world of the scans.
         """
         self._points = points
-        self._distances = np.full(len(points), np.inf)
-        self._is_covered = np.zeros(len(points), np.bool_)
+        self.distances = np.full(len(points), np.nan)
 
     def add(self, world_from_scanner: Array, scan: Array, workers: int = 1) -> None:
         """Compare with one more scan.
@@ -72,21 +74,21 @@ class ScanDistances:
         elevation = _elevation(seen)
         is_inside = (elevation >= low) & (elevation <= high)
         rows = near[is_inside]
-        found, _ = cKDTree(scan).query(
-            seen[is_inside], distance_upper_bound=BEYOND_M, workers=workers
-        )
-        self._is_covered[rows] = True
-        self._distances[rows] = np.minimum(self._distances[rows], found)
+        # As found: balancing the tree takes twice the time of all the rest.
+        tree = cKDTree(scan, balanced_tree=False, compact_nodes=False)
+        found, _ = tree.query(seen[is_inside], distance_upper_bound=BEYOND_M, workers=workers)
+        self.distances[rows] = np.fmin(self.distances[rows], found)
 
-    def errors(self) -> CloudErrors:
-        """Sum up."""
-        distances = self._distances[self._is_covered]
-        coverage = len(distances) / len(self._points) if len(self._points) else None
-        if not len(distances):
-            return CloudErrors(None, None, None, None, 0, coverage)
-        cm_10, cm_20, cm_50 = (float(np.mean(distances <= limit)) for limit in (0.1, 0.2, 0.5))
-        median = float(np.median(distances))
-        return CloudErrors(median, cm_10, cm_20, cm_50, len(distances), coverage)
+
+def cloud_errors(distances: Array) -> CloudErrors:
+    """Sum up (N,) distances of a cloud's points; NaN: not compared."""
+    compared = distances[~np.isnan(distances)]
+    coverage = len(compared) / len(distances) if len(distances) else None
+    if not len(compared):
+        return CloudErrors(None, None, None, None, 0, coverage)
+    cm_10, cm_20, cm_50 = (float(np.mean(compared <= limit)) for limit in (0.1, 0.2, 0.5))
+    median = float(np.median(compared))
+    return CloudErrors(median, cm_10, cm_20, cm_50, len(compared), coverage)
 
 
 def _elevation(points: Array) -> Array:

@@ -2,14 +2,14 @@
 
 Reference: Spann3R (arXiv:2408.16061) and CUT3R (arXiv:2501.12387), whose evaluation the LASER
 paper follows; the outdoor variant is VGGT-Long's (arXiv:2507.16443). Differs: a true point whose
-pixel has no prediction still counts for completeness; networks predict every pixel, so that their
-scores are the same.
+pixel or whose whole frame has no prediction still counts for completeness, however unsure the rest
+is; networks predict every pixel, so that their scores are the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,10 @@ from scipy.spatial import cKDTree
 from laser_slam.dependencies import import_open3d
 from laser_slam.errors import DegenerateGeometryError
 from laser_slam.evaluation.depth import is_known
-from laser_slam.sim3 import Sim3, umeyama
+from laser_slam.sim3 import umeyama
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
-
-KEYFRAME_INTERVAL = 10  # every so many-th frame of 7-Scenes and NRGBD is predicted and compared
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,8 @@ class PointProtocol:
     Attributes:
         icp_threshold_m: farthest partner of a point in the iterative closest point refinement.
         crop_share: side of the central square that is compared, in widths of the map; None: all.
-        dropped_share: share of the pixels, those of least confidence, that is left out, in [0, 1).
+        dropped_share: share of the predicted points of all frames together, those of least
+            confidence, that is left out with their true points, in [0, 1).
         has_normals: False leaves the normals out.
         max_depth_m: true depth beyond it is not compared: see ``comparable_depth``; None: all is.
         far_share: share of all pixels of a frame, the deepest, whose truth is not compared.
@@ -95,6 +94,10 @@ class PointErrors:
         icp_fitness: share of the predicted points with a partner within the threshold at its end.
         num_points: predicted points that are compared.
         num_truth: true points that are compared.
+        coverage: share of the true points whose pixel is predicted, before any is left out for its
+            confidence; None: no truth.
+        num_frames: frames with truth.
+        num_predicted: frames of which any of these points is predicted.
         reason: why nothing is scored; None: it is.
     """
 
@@ -109,6 +112,9 @@ class PointErrors:
     icp_fitness: float | None = None
     num_points: int = 0
     num_truth: int = 0
+    coverage: float | None = None
+    num_frames: int = 0
+    num_predicted: int = 0
     reason: str | None = None
 
 
@@ -118,7 +124,8 @@ def comparable_depth(depth: Depth, protocol: PointProtocol) -> Depth:
     Args:
         depth: (H, W) true depth in metres, as the data set has it, before it is resized; not
             finite or not positive: unknown, which counts as depth 0 for ``far_share``. So where
-            a laser sees a twentieth of the pixels, a share of 0.02 are two fifths of its points.
+            a laser sees a twentieth of the pixels, a share of 0.02 are two fifths of its points,
+            and where it sees no more than that share, nothing is too far.
         protocol: what is compared.
 
     Returns:
@@ -128,7 +135,8 @@ def comparable_depth(depth: Depth, protocol: PointProtocol) -> Depth:
     if protocol.max_depth_m is not None:
         known &= depth <= protocol.max_depth_m
     if protocol.far_share and depth.size:
-        known &= depth <= np.percentile(np.where(known, depth, 0), 100 * (1 - protocol.far_share))
+        limit = np.percentile(np.where(known, depth, 0), 100 * (1 - protocol.far_share))
+        known &= (depth <= limit) | (limit == 0)
     return np.where(known, depth, np.nan).astype(np.float32)
 
 
@@ -136,53 +144,89 @@ def evaluate_points(maps: Iterable[PointMap], protocol: PointProtocol) -> PointE
     """Compare point maps with the truth after Sim(3) alignment and ICP.
 
     Pixels correspond for the alignment (Umeyama), nearest points for the rest. Frames are read one
-    at a time; only what is compared is kept: 48 bytes a pixel.
+    at a time; only what is compared is kept: 57 bytes a pixel.
 
     Args:
-        maps: one for each keyframe, all in one frame of coordinates.
+        maps: one for each frame with truth, all in one frame of coordinates; all NaN where nothing
+            is predicted, so that its truth counts.
         protocol: what is compared.
 
     Raises:
         ValueError: the protocol drops by confidence, and a map has none.
     """
-    found, true = _compared_points(maps, protocol)
-    known = np.isfinite(found).all(axis=1)
-    num_points, num_truth = int(known.sum()), len(true)
+    parts = [part for part in (_known_truth(each, protocol) for each in maps) if len(part.true)]
+    pixels = _join(parts)
+    counted = PointErrors(
+        coverage=float(pixels.is_predicted.mean()) if parts else None,
+        num_frames=len(parts),
+        num_predicted=sum(bool(part.is_predicted.any()) for part in parts),
+    )
+    pixels = _surest(pixels, protocol.dropped_share)
+    found, true = pixels.found[pixels.is_predicted], pixels.true[pixels.is_predicted]
+    counted = replace(counted, num_points=len(found), num_truth=len(pixels.true))
     try:
-        metric_from_world = umeyama(found[known], true[known])
+        metric_from_world = umeyama(found, true)
     except DegenerateGeometryError as error:
-        return PointErrors(num_points=num_points, num_truth=num_truth, reason=str(error))
-    cloud, target = _cloud(metric_from_world.apply(found[known])), _cloud(true)
+        return replace(counted, reason=str(error))
+    cloud, target = _cloud(metric_from_world.apply(found)), _cloud(pixels.true)
     fitness = _refine(cloud, target, protocol.icp_threshold_m)
-    return _scores(cloud, target, protocol, metric_from_world, fitness)
+    counted = replace(counted, scale=metric_from_world.scale, icp_fitness=fitness)
+    return _scores(cloud, target, protocol, counted)
 
 
-def _compared_points(maps: Iterable[PointMap], protocol: PointProtocol) -> tuple[Array, Array]:
-    """Return (N, 3) predictions, NaN where unknown, and their true points, which are known."""
-    parts = [_known_truth(each, protocol) for each in maps]
-    found = np.concatenate([np.empty((0, 3)), *(part[0] for part in parts)])
-    true = np.concatenate([np.empty((0, 3)), *(part[1] for part in parts)])
-    if not protocol.dropped_share or not len(true):
-        return found, true
-    confidence = np.concatenate([part[2] for part in parts])
-    cutoff = np.percentile(confidence, 100 * protocol.dropped_share)
-    return found[confidence >= cutoff], true[confidence >= cutoff]
+@dataclass(frozen=True)
+class _Pixels:
+    """Pixels that have truth.
+
+    Attributes:
+        found: (M, 3) predicted points, NaN where unknown.
+        true: (M, 3).
+        is_predicted: (M,).
+        confidence: (M,); -1: unknown.
+    """
+
+    found: Array
+    true: Array
+    is_predicted: NDArray[np.bool_]
+    confidence: Array
 
 
-def _known_truth(each: PointMap, protocol: PointProtocol) -> tuple[Array, Array, Array]:
-    """Return the (M, 3) points, (M, 3) truth and (M,) confidence of the pixels with truth."""
+def _known_truth(each: PointMap, protocol: PointProtocol) -> _Pixels:
     if protocol.dropped_share and each.confidence is None:
         raise ValueError("the least confident points are to be dropped, and there is no confidence")
     rows, columns = _central_square(each.truth.shape, protocol.crop_share)
-    points, truth = each.points[rows, columns], each.truth[rows, columns]
-    valid = np.isfinite(truth).all(axis=-1)
-    found = np.where(np.isfinite(points).all(axis=-1, keepdims=True), points, np.nan)[valid]
-    if each.confidence is None:
-        return found, truth[valid], np.empty(0)
-    confidence = each.confidence[rows, columns][valid].astype(np.float64)
-    # What is not predicted, or nothing is known of, is dropped first.
-    confidence[np.isnan(found[:, 0]) | np.isnan(confidence)] = -1.0
-    return found, truth[valid], confidence
+    found, true = each.points[rows, columns], each.truth[rows, columns]
+    valid = np.isfinite(true).all(axis=-1)
+    found, true = found[valid], true[valid]
+    confidence = np.full(len(true), -1.0)
+    if each.confidence is not None:
+        given = each.confidence[rows, columns][valid]
+        confidence = np.where(np.isnan(given), -1.0, given)
+    return _Pixels(found, true, np.asarray(np.isfinite(found).all(axis=-1)), confidence)
+
+
+def _join(parts: Sequence[_Pixels]) -> _Pixels:
+    """Put the pixels of all frames together."""
+    return _Pixels(
+        np.concatenate([np.empty((0, 3)), *(part.found for part in parts)]),
+        np.concatenate([np.empty((0, 3)), *(part.true for part in parts)]),
+        np.concatenate([np.empty(0, np.bool_), *(part.is_predicted for part in parts)]),
+        np.concatenate([np.empty(0), *(part.confidence for part in parts)]),
+    )
+
+
+def _surest(pixels: _Pixels, dropped_share: float) -> _Pixels:
+    """Leave out the least confident share of the predicted points, and their true points."""
+    if not dropped_share or not pixels.is_predicted.any():
+        return pixels
+    cutoff = np.percentile(pixels.confidence[pixels.is_predicted], 100 * dropped_share)
+    kept = (pixels.confidence >= cutoff) | ~pixels.is_predicted
+    return _Pixels(
+        pixels.found[kept],
+        pixels.true[kept],
+        pixels.is_predicted[kept],
+        pixels.confidence[kept],
+    )
 
 
 def _central_square(shape: tuple[int, ...], share: float | None) -> tuple[slice, slice]:
@@ -207,9 +251,7 @@ def _refine(cloud: Any, target: Any, threshold: float) -> float:
     return float(result.fitness)
 
 
-def _scores(
-    cloud: Any, target: Any, protocol: PointProtocol, metric_from_world: Sim3, fitness: float
-) -> PointErrors:
+def _scores(cloud: Any, target: Any, protocol: PointProtocol, counted: PointErrors) -> PointErrors:
     points, truth = np.asarray(cloud.points), np.asarray(target.points)
     acc, nearest_true = cKDTree(truth).query(points, workers=-1)
     comp, nearest_point = cKDTree(points).query(truth, workers=-1)
@@ -220,7 +262,8 @@ def _scores(
         back = np.abs((true_normals * normals[nearest_point]).sum(axis=1))
         nc_mean = float(there.mean() + back.mean()) / 2
         nc_median = float(np.median(there) + np.median(back)) / 2
-    return PointErrors(
+    return replace(
+        counted,
         acc_mean_m=float(acc.mean()),
         acc_median_m=float(np.median(acc)),
         comp_mean_m=float(comp.mean()),
@@ -228,10 +271,6 @@ def _scores(
         nc_mean=nc_mean,
         nc_median=nc_median,
         chamfer_m=float(acc.mean() + comp.mean()) / 2,
-        scale=metric_from_world.scale,
-        icp_fitness=fitness,
-        num_points=len(points),
-        num_truth=len(truth),
     )
 
 

@@ -8,7 +8,7 @@ counted; a sequence without any compared pixel has no score, where they give it 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Literal
 
@@ -58,18 +58,23 @@ class VideoDepthErrors:
         abs_rel: mean of |depth - truth| / truth over all compared pixels of the video.
         delta_125: share of them whose depth is within a factor 1.25 of the truth, in [0, 1].
         scale: metres per unit of depth that was applied first.
-        num_pixels: compared pixels; the weight of this video in a mean over videos.
+        num_pixels: compared pixels.
+        num_true_pixels: pixels with truth below the cap, compared or not: the weight of this video
+            in a mean over videos, so that no method makes the videos count less that it fails on.
         num_frames: frames with truth.
+        num_predicted: those of them that have any depth.
         coverage: share of the pixels with truth below the cap that were compared; None: none is.
         reason: why nothing is scored; None: it is.
     """
 
-    abs_rel: float | None
-    delta_125: float | None
-    scale: float | None
-    num_pixels: int
-    num_frames: int
-    coverage: float | None
+    abs_rel: float | None = None
+    delta_125: float | None = None
+    scale: float | None = None
+    num_pixels: int = 0
+    num_true_pixels: int = 0
+    num_frames: int = 0
+    num_predicted: int = 0
+    coverage: float | None = None
     reason: str | None = None
 
 
@@ -90,19 +95,23 @@ def evaluate_video_depth(
         alignment: ``scale``: as above; ``metric``: depth is in metres already.
     """
     pixels = _ComparedPixels(pairs, protocol.max_depth_m)
-    coverage = pixels.num / pixels.num_true if pixels.num_true else None
+    counted = VideoDepthErrors(
+        num_pixels=pixels.num,
+        num_true_pixels=pixels.num_true,
+        num_frames=pixels.num_frames,
+        num_predicted=pixels.num_predicted,
+        coverage=pixels.num / pixels.num_true if pixels.num_true else None,
+    )
     if not pixels.num:
         reason = "no pixel has both depth and truth" if pixels.num_true else "no pixel has truth"
-        return VideoDepthErrors(None, None, None, 0, pixels.num_frames, coverage, reason)
+        return replace(counted, reason=reason)
     scale = _scale(pixels) if alignment == "scale" else 1.0
     ceiling = np.inf if protocol.clip_m is None else protocol.clip_m
     sums = np.zeros(2)
     for found, true in pixels:
         sums += _error_sums(np.minimum(scale * found, ceiling), true)
     abs_rel, delta_125 = (sums / pixels.num).tolist()
-    return VideoDepthErrors(
-        abs_rel, delta_125, scale, pixels.num, pixels.num_frames, coverage, None
-    )
+    return replace(counted, abs_rel=abs_rel, delta_125=delta_125, scale=scale)
 
 
 def resize_depth(depth: Depth, size: tuple[int, int]) -> Depth:
@@ -126,9 +135,10 @@ class _ComparedPixels:
         self._pairs = pairs
         self._ceiling = np.inf if max_depth_m is None else max_depth_m
         self._kept: list[tuple[Depth, Depth]] | None = []
-        self.num = self.num_true = self.num_frames = 0
+        self.num = self.num_true = self.num_frames = self.num_predicted = 0
         for found, true, num_true in self._read():
-            self.num_frames += 1
+            self.num_frames += num_true > 0
+            self.num_predicted += len(true) > 0
             self.num_true += num_true
             self.num += len(true)
             if self.num > _MEMORY_PIXELS:
