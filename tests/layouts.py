@@ -1,11 +1,12 @@
-"""The corridor, written as the published data sets lay their sequences out."""
+"""A scene of known content, written as the published data sets lay their sequences out."""
 
 from __future__ import annotations
 
+import shutil
 import struct
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -22,11 +23,14 @@ from laser_slam.datasets.bonn import Bonn
 from laser_slam.datasets.kitti_depth import KittiDepth
 from laser_slam.datasets.nrgbd import Nrgbd
 from laser_slam.datasets.scannet import ScanNet
+from laser_slam.datasets.seven_scenes import SevenScenes
 from laser_slam.datasets.sintel import Sintel
 from laser_slam.datasets.tum_rgbd import TumRgbd
 from laser_slam.datasets.waymo import Waymo
+from laser_slam.types import Image
 
 Array = NDArray[np.float64]
+Depth = NDArray[np.float32]
 
 T0 = 1311868164.363181  # seconds of the epoch, as TUM's times are
 DAY, DRIVE = "2011_09_26", "2011_09_26_drive_0002_sync"
@@ -35,9 +39,32 @@ view = cache(render)
 FIRST_DEPTH = 5  # KITTI: the first five images of a drive have none
 
 
-def counts(frame: int, units_per_m: float) -> NDArray[np.uint16]:
-    """Return the depth as 16-bit numbers, 0 where they do not reach."""
-    stored = np.rint(view(frame)[1].astype(np.float64) * units_per_m)
+@dataclass(frozen=True)
+class Scene:
+    """What the sequences show: image (H, W, 3) and depth (H, W) of each frame, and its camera.
+
+    Frames below 0 may be asked for their images. Depth is z in metres; NaN: unknown.
+    """
+
+    image: Callable[[int], Image]
+    depth: Callable[[int], Depth]
+    pose: Callable[[int], Array]
+    intrinsics: Array
+    size: tuple[int, int]
+
+
+CORRIDOR = Scene(
+    lambda frame: view(frame)[0],
+    lambda frame: view(frame)[1],
+    true_pose,
+    true_intrinsics(),
+    SIZE,
+)
+
+
+def counts(frame: int, units_per_m: float, scene: Scene = CORRIDOR) -> NDArray[np.uint16]:
+    """Return the depth as 16-bit numbers, 0 where it is unknown or they do not reach."""
+    stored = np.rint(scene.depth(frame).astype(np.float64) * units_per_m)
     return np.where(stored <= 65535, stored, 0).astype(np.uint16)
 
 
@@ -100,16 +127,16 @@ def _packed(raw: bytes) -> bytes:
     return packed if len(packed) < len(raw) else raw
 
 
-def tum(folder: Path, num: int, pose_of: Callable[[int], Array] = true_pose) -> None:
+def tum(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
     """Write rgb, depth and a trajectory, each with a clock of its own and rows between."""
     rgb, depth, truth = [], [], []
     for frame in range(num):
         time = T0 + frame / 30
-        write_png(folder / "rgb" / f"{time:.6f}.png", view(frame)[0])
-        write_png(folder / "depth" / f"{time + 0.012:.6f}.png", counts(frame, 5000))
+        write_png(folder / "rgb" / f"{time:.6f}.png", scene.image(frame))
+        write_png(folder / "depth" / f"{time + 0.012:.6f}.png", counts(frame, 5000, scene))
         rgb.append(f"{time:.6f} rgb/{time:.6f}.png")
         depth.append(f"{time + 0.012:.6f} depth/{time + 0.012:.6f}.png")
-        pose = pose_of(frame)
+        pose = scene.pose(frame)
         numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
         truth.append(f"{time + 0.003:.6f} " + " ".join(f"{number:.9f}" for number in numbers))
         truth.append(f"{time + 0.016:.6f} 9 9 9 0 0 0 1")  # of no image
@@ -117,7 +144,8 @@ def tum(folder: Path, num: int, pose_of: Callable[[int], Array] = true_pose) -> 
         write_text(folder / f"{name}.txt", "\n".join(["# title", "# file: x.bag", *lines]) + "\n")
 
 
-def bonn(folder: Path, num: int) -> None:
+def bonn(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
+    """Write what TUM has, with the poses of the markers."""
     turned = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
     published = np.array(
         [[1.0157, 0.1828, -0.2389], [0.0009, -0.8431, -0.6413], [-0.3009, 0.6147, -0.8085]]
@@ -128,82 +156,183 @@ def bonn(folder: Path, num: int) -> None:
     ).as_matrix()
     markers_from_cam[:3, 3] = [0.0113, -0.0098, 0.0111]
     back = np.linalg.inv(turned @ markers_from_cam)
-    tum(folder, num, lambda frame: np.asarray(turned @ true_pose(frame) @ back))
+    markers = replace(scene, pose=lambda frame: np.asarray(turned @ scene.pose(frame) @ back))
+    tum(folder, num, markers)
 
 
-def scannet(folder: Path, num: int) -> None:
+def scannet(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
+    """Write what ScanNet's Python reader exports, depth at half the size."""
     for frame in range(num):
-        write_jpg(folder / "color" / f"{frame}.jpg", view(frame)[0])
-        write_png(folder / "depth" / f"{frame}.png", counts(frame, 1000)[1::2, 1::2])
-        write_matrix(folder / "pose" / f"{frame}.txt", true_pose(frame))
+        write_jpg(folder / "color" / f"{frame}.jpg", scene.image(frame))
+        write_png(folder / "depth" / f"{frame}.png", counts(frame, 1000, scene)[1::2, 1::2])
+        write_matrix(folder / "pose" / f"{frame}.txt", scene.pose(frame))
+    write_matrix(folder / "intrinsic" / "intrinsic_color.txt", _four(scene.intrinsics))
+
+
+def scannet_by_cpp(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
+    """Write what ScanNet's C++ reader exports."""
+    for frame in range(num):
+        stem = folder / f"frame-{frame:06d}"
+        write_jpg(stem.with_suffix(".color.jpg"), scene.image(frame))
+        stored = counts(frame, 1000, scene)[1::2, 1::2]
+        head = f"P5\n# data values are 16-bit each; depth shift is 1000\n{stored.shape[1]} "
+        head += f"{stored.shape[0]}\n65535\n"
+        write_bytes(stem.with_suffix(".depth.pgm"), head.encode() + stored.astype(">u2").tobytes())
+        write_matrix(stem.with_suffix(".pose.txt"), scene.pose(frame))
+    numbers = " ".join(f"{number:.9g}" for number in _four(scene.intrinsics).ravel())
+    write_text(
+        folder / "_info.txt",
+        f"m_versionNumber = 4\nm_depthShift = 1000\nm_calibrationColorIntrinsic = {numbers} \n"
+        "m_frames.size = 9\n",
+    )
+
+
+def _four(intrinsics: Array) -> Array:
     matrix = np.eye(4)
-    matrix[:3, :3] = true_intrinsics()
-    write_matrix(folder / "intrinsic" / "intrinsic_color.txt", matrix)
+    matrix[:3, :3] = intrinsics
+    return matrix
 
 
-def nrgbd(folder: Path, num: int) -> None:
+def seven_scenes(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
+    """Write images, poses, and depth as it is after it was moved to the colour camera."""
+    for frame in range(num):
+        stem = folder / f"frame-{frame:06d}"
+        write_png(stem.with_suffix(".color.png"), scene.image(frame))
+        write_png(stem.with_suffix(".depth.png"), counts(frame, 1000, scene)[:, ::-1])
+        write_png(stem.with_suffix(".depth.proj.png"), counts(frame, 1000, scene))
+        write_matrix(stem.with_suffix(".pose.txt"), scene.pose(frame))
+
+
+def nrgbd(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
     poses = []
     for frame in range(num):
-        write_png(folder / "images" / f"img{frame}.png", view(frame)[0])
-        write_png(folder / "depth" / f"depth{frame}.png", counts(frame, 1000))
-        poses.append(true_pose(frame) * [1, -1, -1, 1])  # columns: x, y, z, place
+        write_png(folder / "images" / f"img{frame}.png", scene.image(frame))
+        write_png(folder / "depth" / f"depth{frame}.png", counts(frame, 1000, scene))
+        poses.append(scene.pose(frame) * [1, -1, -1, 1])  # columns: x, y, z, place
     write_matrix(folder / "poses.txt", np.concatenate(poses))
-    write_text(folder / "focal.txt", f"{true_intrinsics()[0, 0]}\n")
+    write_text(folder / "focal.txt", f"{scene.intrinsics[0, 0]}\n")
 
 
-def sintel(folder: Path, num: int) -> None:
+def sintel(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
     training, name = folder.parent.parent, folder.name
     tag = struct.pack("<f", 202021.25)
     for frame in range(num):
         stem = f"frame_{frame + 1:04d}"
-        write_png(folder / f"{stem}.png", view(frame)[0])
-        head = tag + struct.pack("<2i", SIZE[1], SIZE[0])
-        depth = view(frame)[1].astype("<f4")
+        write_png(folder / f"{stem}.png", scene.image(frame))
+        head = tag + struct.pack("<2i", scene.size[1], scene.size[0])
+        depth = np.nan_to_num(scene.depth(frame), nan=1e10).astype("<f4")
         write_bytes(training / "depth" / name / f"{stem}.dpt", head + depth.tobytes())
-        cam_from_world = np.linalg.inv(true_pose(frame))[:3]
-        camera = true_intrinsics().tobytes() + np.ascontiguousarray(cam_from_world).tobytes()
+        cam_from_world = np.linalg.inv(scene.pose(frame))[:3]
+        camera = scene.intrinsics.tobytes() + np.ascontiguousarray(cam_from_world).tobytes()
         write_bytes(training / "camdata_left" / name / f"{stem}.cam", tag + camera)
 
 
-def waymo(folder: Path, num: int) -> None:
+def waymo(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
     for frame in range(num):
         stem = folder / f"{frame:05d}_1"
-        write_jpg(stem.with_suffix(".jpg"), view(frame)[0])
-        write_jpg(folder / f"{frame:05d}_2.jpg", view(frame)[0][:, ::-1])
-        write_exr(stem.with_suffix(".exr"), scanned(frame))
+        write_jpg(stem.with_suffix(".jpg"), scene.image(frame))
+        write_jpg(folder / f"{frame:05d}_2.jpg", scene.image(frame)[:, ::-1])
+        write_exr(stem.with_suffix(".exr"), scanned(frame, scene))
         np.savez(
             stem.with_suffix(".npz"),
-            intrinsics=true_intrinsics(),
-            cam2world=true_pose(frame),
+            intrinsics=scene.intrinsics,
+            cam2world=scene.pose(frame),
             distortion=np.zeros(5),
         )
 
 
-def scanned(frame: int) -> NDArray[np.float32]:
+def scanned(frame: int, scene: Scene = CORRIDOR) -> Depth:
     """Return the depth where a LiDAR would hit, 0 elsewhere."""
-    hits = np.random.default_rng(frame).random(SIZE) < 0.2
-    return np.where(hits, view(frame)[1], 0).astype(np.float32)
+    hits = np.random.default_rng(frame).random(scene.size) < 0.2
+    return np.where(hits, np.nan_to_num(scene.depth(frame)), 0).astype(np.float32)
 
 
-def kitti_depth(folder: Path, num: int) -> None:
+def kitti_depth(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
     """Write a drive of which the first and last five images have no depth."""
-    day = folder.parent.parent / "raw" / DAY
-    images = day / DRIVE / "image_02" / "data"
+    day = folder.parent.parent / "raw" / folder.name[:10]
+    images = day / folder.name / "image_02" / "data"
     for number in range(num + 2 * FIRST_DEPTH):
-        write_png(images / f"{number:010d}.png", view(number - FIRST_DEPTH)[0])
+        write_png(images / f"{number:010d}.png", scene.image(number - FIRST_DEPTH))
     for frame in range(num):
         path = folder / "proj_depth" / "groundtruth" / "image_02"
-        write_png(path / f"{frame + FIRST_DEPTH:010d}.png", counts(frame, 256))
-    row = np.column_stack([true_intrinsics(), [44.9, 0.2, 0.003]]).ravel()
+        write_png(path / f"{frame + FIRST_DEPTH:010d}.png", counts(frame, 256, scene))
+    row = np.column_stack([scene.intrinsics, [44.9, 0.2, 0.003]]).ravel()
     numbers = " ".join(f"{number:.9e}" for number in row)
     write_text(day / "calib_cam_to_cam.txt", f"calib_time: 09-Jan-2012\nP_rect_02: {numbers}\n")
+
+
+def kitti_odometry(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
+    """Write ``sequences/SEQ``; its poses go where the official ones are."""
+    for frame in range(num):
+        write_png(folder / "image_2" / f"{frame:06d}.png", scene.image(frame))
+    rows = [np.column_stack([scene.intrinsics, [shift, 0, 0]]) for shift in (0, -386, 45, -335)]
+    lines = [" ".join(f"{number:.12e}" for number in row.ravel()) for row in rows]
+    calibration = "".join(f"P{camera}: {line}\n" for camera, line in enumerate(lines))
+    write_text(folder / "calib.txt", calibration)
+    write_text(folder / "times.txt", "".join(f"{frame / 10:.6e}\n" for frame in range(num)))
+    path = folder.parent.parent / "poses" / f"{folder.name}.txt"
+    write_matrix(path, np.array([scene.pose(frame)[:3].ravel() for frame in range(num)]))
+
+
+def choose_tum(folder: Path, step: int, num: int) -> Path:
+    """Copy images and poses as MonST3R's ``prepare_tum.py`` does; give the folder of the images."""
+    lists = {}
+    for name in ("rgb", "groundtruth"):
+        lines = (folder / f"{name}.txt").read_text().splitlines()
+        lists[name] = [line for line in lines if line[0] != "#"]
+    posed = lists["groundtruth"][::2]  # each second line is of no image
+    chosen = list(zip(lists["rgb"], posed, strict=True))[::step][:num]
+    for line, _ in chosen:
+        _copy(folder / line.split()[1], folder / "rgb_90")
+    write_text(folder / "groundtruth_90.txt", "".join(f"{pose}\n" for _, pose in chosen))
+    return folder / "rgb_90"
+
+
+def choose_bonn(folder: Path, first: int, num: int) -> Path:
+    """Copy images and depth by rank as MonST3R's ``prepare_bonn.py`` does, and poses by rank."""
+    for kind in ("rgb", "depth"):
+        for path in sorted((folder / kind).iterdir())[first : first + num]:
+            _copy(path, folder / f"{kind}_110")
+    rows = np.loadtxt(folder / "groundtruth.txt")[first : first + num]
+    np.savetxt(folder / "groundtruth_110.txt", rows)
+    return folder / "rgb_110"
+
+
+def choose_scannet(folder: Path, step: int, num: int) -> Path:
+    """Copy and number anew as MonST3R's ``prepare_scannet.py`` does."""
+    poses = []
+    for index in range(num):
+        number = index * step
+        for kind, suffix in (("color", "jpg"), ("depth", "png")):
+            source = folder / kind / f"{number}.{suffix}"
+            _copy(source, folder / f"{kind}_90", f"frame_{index:04d}.{suffix}")
+        poses.append(np.loadtxt(folder / "pose" / f"{number}.txt").ravel())
+    lines = (" ".join(map(str, pose.tolist())) for pose in poses)
+    write_text(folder / "pose_90.txt", "".join(f"{line}\n" for line in lines))
+    return folder / "color_90"
+
+
+def choose_kitti_depth(folder: Path, num: int) -> Path:
+    """Copy depth and images as MonST3R's ``prepare_kitti.py`` does."""
+    root = folder.parent.parent / "depth_selection" / "val_selection_cropped"
+    raw = folder.parent.parent / "raw" / folder.name[:10] / folder.name / "image_02" / "data"
+    depths = sorted((folder / "proj_depth" / "groundtruth" / "image_02").iterdir())[:num]
+    for path in depths:
+        _copy(path, root / "groundtruth_depth_gathered" / f"{folder.name}_02")
+        _copy(raw / path.name, root / "image_gathered" / f"{folder.name}_02")
+    return root / "image_gathered" / f"{folder.name}_02"
+
+
+def _copy(path: Path, folder: Path, name: str | None = None) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    shutil.copy(path, folder / (name or path.name))
 
 
 @dataclass(frozen=True)
 class Layout:
     """How one data set is written and opened, and what is known of what comes out."""
 
-    write: Callable[[Path, int], None]
+    write: Callable[[Path, int, Scene], None]
     open: Callable[[Path], Dataset]
     place: str
     name: str
@@ -239,6 +368,16 @@ LAYOUTS = {
     "scannet": Layout(
         scannet, ScanNet, "scene0707_00", "scannet-scene0707_00", 30, 1e-3, is_lossy=True
     ),
+    "7scenes": Layout(
+        seven_scenes,
+        SevenScenes,
+        "redkitchen/seq-03",
+        "7scenes-redkitchen-seq-03",
+        30,
+        1e-3,
+        65.5,
+        has_own_lens=False,
+    ),
     "nrgbd": Layout(nrgbd, Nrgbd, "corridor", "nrgbd-corridor", 30, 1e-3),
     "sintel": Layout(sintel, Sintel, "training/final/alley_2", "sintel-final-alley_2", 24),
     "waymo": Layout(
@@ -265,7 +404,7 @@ def write_layout(key: str, root: Path, num: int) -> Path:
     """Write a miniature and return the folder that a user would give."""
     layout = LAYOUTS[key]
     folder = root / layout.place
-    layout.write(folder, num)
+    layout.write(folder, num, CORRIDOR)
     return folder
 
 

@@ -275,7 +275,8 @@ def test_an_unreadable_image_comes_as_none_and_the_others_as_they_are(
 def test_without_truth_a_sequence_is_still_a_sequence(key: str, tmp_path: Path) -> None:
     folder = write_layout(key, tmp_path, NUM)
     truth = ["depth.txt", "groundtruth.txt", "poses.txt", "focal.txt"]
-    for path in [*(folder / name for name in truth), *folder.glob("*.exr")]:
+    loose = (path for end in ("exr", "depth*.png", "pose.txt") for path in folder.glob(f"*.{end}"))
+    for path in [*(folder / name for name in truth), *loose]:
         path.unlink(missing_ok=True)
     for name in ("depth", "pose", "intrinsic"):
         shutil.rmtree(folder / name, ignore_errors=True)
