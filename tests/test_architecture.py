@@ -19,7 +19,7 @@ STAGES = [
 ]
 STAGES += ["viewer", "report", "layers", "places", "pose_graph", "lidar_odometry"]
 COMPOSITION = ["closures", "slam", "bookkeeping", "results", "rescoring", "predicting", "pipeline"]
-COMPOSITION += ["exporting", "viewing", "lidar_comparison", "lidar_reference", "benchmarks"]
+COMPOSITION += ["exporting", "viewing", "lidar", "benchmarks"]
 COMPOSITION += ["console", "cli"]
 TORCH = {"torch", "safetensors"}  # no dependencies of a plain installation
 HEAVY = {"open3d", *TORCH, "gtsam", "numba", "cv2", "matplotlib", "scipy"}

@@ -30,8 +30,9 @@ from laser_slam.cli import app
 from laser_slam.config import load_config
 from laser_slam.datasets.velodyne import Rig, Velodyne
 from laser_slam.errors import DegenerateGeometryError
-from laser_slam.evaluation.clouds import ScanDistances
-from laser_slam.lidar_comparison import align_cameras, compare_with_run, stretch_scales
+from laser_slam.evaluation.clouds import ScanDistances, cloud_errors
+from laser_slam.lidar import compare_with_run
+from laser_slam.lidar.alignment import align_cameras, align_pieces, stretch_scales
 from laser_slam.pipeline import Pipeline
 from laser_slam.sim3 import Sim3, rotation_exp
 from laser_slam.types import Prediction, Trajectory
@@ -88,7 +89,9 @@ def judge(folder: Path, backbone: TrueBackbone, velodyne: Velodyne) -> dict[str,
         for name in ("draw_findings", "stages_picture"):
             patch.setattr(laser_slam.pipeline, name, lambda *_: None)
         Pipeline(Corridor(NUM, with_truth=False), CONFIG, folder, backbone=backbone).run()
-    return compare_with_run(folder, true_path(), velodyne)
+    out = folder.with_name(f"{folder.name}-lidar")
+    out.mkdir()
+    return compare_with_run(folder, true_path(), velodyne, out)
 
 
 @pytest.fixture(scope="module")
@@ -178,6 +181,40 @@ def test_a_straight_path_does_not_leave_the_roll_open() -> None:
     assert len(scales) == len(SCANNED) - 1
 
 
+def drifted(truth: Trajectory, bend_rad: float) -> Trajectory:
+    """Bend a path a little at each frame, as odometry does, and take it in other units."""
+    motions = np.linalg.inv(truth.world_from_cam[:-1]) @ truth.world_from_cam[1:]
+    motions[:, :3, :3] = motions[:, :3, :3] @ rotation_exp(np.array([0, bend_rad, 0]))
+    motions[:, :3, 3] *= np.linspace(0.25, 0.5, len(motions))[:, None]
+    poses = [np.eye(4)]
+    for motion in motions:
+        poses.append(poses[-1] @ motion)
+    return replace(truth, world_from_cam=np.stack(poses))
+
+
+def test_pieces_of_a_path_that_drifts_lie_on_the_truth() -> None:
+    truth = true_path(range(0, 1000, 2))  # 400 m
+    path = drifted(truth, 0.002)
+    pieces, whole = align_pieces(path, truth), align_cameras(path, truth)
+    assert len(pieces.lidar_from_world) == 8
+    centers, true = path.world_from_cam[:, :3, 3], truth.world_from_cam[:, :3, 3]
+    assert np.linalg.norm(whole.apply(centers) - true, axis=1).max() > 20
+    assert np.linalg.norm(pieces.apply(centers) - true, axis=1).max() < 1.5
+    scales = np.array([pieces.at(int(frame)).scale for frame in truth.frames])
+    np.testing.assert_allclose(1 / scales, np.linspace(0.25, 0.5, len(scales)), rtol=0.08)
+
+
+def test_a_piece_in_which_the_run_is_lost_goes_with_the_whole_path() -> None:
+    truth = true_path(range(0, 300, 2))  # 120 m
+    poses = truth.world_from_cam.copy()
+    poses[80:] = poses[79]
+    lost = replace(truth, world_from_cam=poses)
+    pieces = align_pieces(lost, truth)
+    assert len(pieces.lidar_from_world) == 2
+    assert pieces.at(298).scale == align_cameras(lost, truth).scale
+    assert pieces.at(0).scale == pytest.approx(1)
+
+
 def test_paths_without_motion_have_no_scale() -> None:
     path = true_path()
     still = replace(path, world_from_cam=np.tile(np.eye(4), (len(SCANNED), 1, 1)))
@@ -195,7 +232,7 @@ def test_points_before_a_wall_are_as_far_from_it_as_they_are() -> None:
     for offset, shares in ((0.05, [1, 1, 1]), (0.15, [0, 1, 1]), (0.4, [0, 0, 1])):
         distances = ScanDistances(scan[::11] - [offset, 0, 0])
         distances.add(np.eye(4), scan)
-        errors = distances.errors()
+        errors = cloud_errors(distances.distances)
         assert errors.median_m is not None
         assert abs(errors.median_m - offset) < 0.02
         found = np.array([errors.within_10_cm, errors.within_20_cm, errors.within_50_cm])
@@ -206,9 +243,9 @@ def test_points_outside_the_field_of_every_scan_are_not_compared() -> None:
     scan = np.stack(np.meshgrid([10.0], np.arange(-5, 5, 0.1), np.arange(-2, 1, 0.1)), -1)
     roof, wall, beyond = np.array([10.0, 0, 6]), np.array([10.0, 0, 0]), np.array([300.0, 0, 0])
     distances = ScanDistances(np.stack([roof, wall, beyond]))
-    assert distances.errors().median_m is None
+    assert cloud_errors(distances.distances).median_m is None
     distances.add(np.eye(4), scan.reshape(-1, 3))
-    errors = distances.errors()
+    errors = cloud_errors(distances.distances)
     assert errors.num_points == 1
     assert errors.coverage == pytest.approx(1 / 3)
     assert errors.median_m == pytest.approx(0, abs=1e-9)

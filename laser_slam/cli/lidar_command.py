@@ -13,7 +13,7 @@ from laser_slam.cli.app import HELP_NAMES, QuietOption, RunOptions, app, command
 from laser_slam.cli.sources import RootOption, open_kitti, source
 
 if TYPE_CHECKING:
-    from laser_slam.lidar_reference import LidarDataset
+    from laser_slam.lidar import LidarDataset
 
 lidar_app = typer.Typer(
     help="Find a sequence's metric path by its laser scans (KISS-ICP); compare a run with them.",
@@ -23,7 +23,10 @@ lidar_app = typer.Typer(
 
 CalibrationOption = Annotated[
     Path | None,
-    typer.Option("--calibration", help="Folder of the date's calib_*.txt. [DIR, or the one above]"),
+    typer.Option(
+        "--calibration",
+        help="Folder of calib_*.txt, or KITTI's date, such as 2011_09_26. [DIR, or the one above]",
+    ),
 ]
 DriveArgument = Annotated[
     Path, typer.Argument(metavar="DIR", help="Such as 2011_09_26/2011_09_26_drive_0001_sync.")
@@ -47,7 +50,7 @@ class LidarFlags:
     def work(self, dataset: LidarDataset) -> None:
         """Track the scans and print what they say."""
         from laser_slam.console import progress_display
-        from laser_slam.lidar_reference import make_reference, summarize_lidar
+        from laser_slam.lidar import make_reference, summarize_lidar
 
         with progress_display(quiet=self.quiet) as on_progress:
             reference = make_reference(dataset, self.out, self.run, on_progress)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.datasets.intrinsics import check_intrinsics
+from laser_slam.datasets.kitti_dates import DAYS
 from laser_slam.datasets.velodyne import Rig
 from laser_slam.errors import DatasetError
 from laser_slam.sim3 import orthonormal
@@ -65,7 +66,7 @@ def raw_rig(folder: Path, camera: str, size: tuple[int, int], advice: str) -> Ri
     """Read ``calib_cam_to_cam.txt`` and ``calib_velo_to_cam.txt`` of KITTI's raw data.
 
     Args:
-        folder: that holds both.
+        folder: that holds both; or, where there is no such folder, one of KITTI's dates.
         camera: such as ``image_02``.
         size: (height, width) of the images.
         advice: what to do where the files will not do.
@@ -74,7 +75,11 @@ def raw_rig(folder: Path, camera: str, size: tuple[int, int], advice: str) -> Ri
         DatasetError: a file or row is missing or malformed, or the images are of another size.
     """
     cameras, scanner = folder / "calib_cam_to_cam.txt", folder / "calib_velo_to_cam.txt"
-    rows, velo = read_rows(cameras, advice), read_rows(scanner, advice)
+    day = None if folder.is_dir() else DAYS.get(str(folder))
+    if day is None:
+        rows, velo = read_rows(cameras, advice), read_rows(scanner, advice)
+    else:
+        rows, velo = day.cameras(), day.scanner()
     turn = _row(velo, "R", 9, scanner, advice).reshape(3, 3)
     move = _row(velo, "T", 3, scanner, advice)
     unrectified_from_velo = _rigid(np.column_stack([turn, move]), f"{scanner}, rows R and T")

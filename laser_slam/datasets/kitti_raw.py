@@ -18,6 +18,7 @@ from laser_slam.datasets.decoding import (
     read_image,
 )
 from laser_slam.datasets.kitti_calibration import raw_rig
+from laser_slam.datasets.kitti_dates import DAYS
 from laser_slam.datasets.velodyne import Depth, Velodyne, find_scans
 from laser_slam.errors import DatasetError
 from laser_slam.types import Frame, SequenceInfo
@@ -28,7 +29,8 @@ CAMERAS = ("image_02", "image_00")  # left colour, then left grey
 FPS = 10.0
 AGAIN = "unpack the drive again"
 CALIBRATION_ADVICE = (
-    "pass --calibration, the folder of the date's calib_cam_to_cam.txt and calib_velo_to_cam.txt"
+    "pass --calibration, the folder of the date's calib_cam_to_cam.txt and calib_velo_to_cam.txt, "
+    f"or, for KITTI's own drives, the date: {', '.join(DAYS)}"
 )
 logger = logging.getLogger(__name__)
 
@@ -43,7 +45,8 @@ class KittiRaw:
 
     Args:
         folder: of the drive, such as ``2011_09_26/2011_09_26_drive_0001_sync``.
-        calibration: folder that holds the calibration files; None: they are where KITTI puts them.
+        calibration: folder that holds the calibration files, or a date of KITTI's, such as
+            ``2011_09_26``; None: the files are where KITTI puts them.
         camera: such as ``image_03``; None: left colour if it is there, else left grey.
 
     Raises:
@@ -66,7 +69,7 @@ class KittiRaw:
             size,
             len(self._paths),
             self._rig.intrinsics,
-            f"calib_cam_to_cam.txt, row P_rect_{camera[-2:]}",
+            f"{_calibration_name(where)}, row P_rect_{camera[-2:]}",
             files=tuple(self._paths),
         )
         self._velodyne = self._find_velodyne()
@@ -138,6 +141,11 @@ def _find_images(folder: Path, camera: str | None) -> tuple[Path, list[Path]]:
     if missing:
         raise DatasetError(f"image {missing[0]:010d} is missing in {images}; {AGAIN}")
     return images, [numbers[number] for number in sorted(numbers)]
+
+
+def _calibration_name(where: Path) -> str:
+    is_date = not where.is_dir() and str(where) in DAYS
+    return f"KITTI's calibration of {where}" if is_date else "calib_cam_to_cam.txt"
 
 
 def _find_calibration(folder: Path) -> Path:
