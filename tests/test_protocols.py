@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from laser_slam.benchmarks.measures import MEASURES, look_up, remarks, weight, why_missing
-from laser_slam.benchmarks.protocols import PROTOCOLS
+from laser_slam.benchmarks.protocols import FOCAL_READ_AS, PROTOCOLS, published_camera
 from laser_slam.camera import intrinsics_matrix, rays
 from laser_slam.export import DepthView
 from laser_slam.sim3 import Sim3, rotation_exp
@@ -163,6 +163,47 @@ def test_a_run_without_depth_says_so(
     views.clear()
     errors = PROTOCOLS[protocol](tmp_path, Wall())
     assert errors["reason"] in {"the run has no depth map", "no pixel has both depth and truth"}
+
+
+# --- the truth of published tables ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("focal_px", "focal_as"), [(525.0, FOCAL_READ_AS), (554.2562584220408, 1.0)]
+)
+def test_published_truth_of_rooms_has_the_camera_of_its_evaluation(
+    focal_px: float, focal_as: float
+) -> None:
+    """Both data sets with NRGBD's focal length, both axes with the larger factor 392 / 480."""
+    factor = 392 / 480
+    true = intrinsics_matrix(focal_px, focal_px, 320.0, 240.0)
+    found = published_camera(true, (480, 640), (392, 518), focal_as)
+    focal = 554.2562584220408 * factor
+    expected = intrinsics_matrix(focal, focal, 320.5 * factor - 0.5, 240.5 * factor - 0.5)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    half = published_camera(true, (480, 640), (196, 259), focal_as)
+    np.testing.assert_allclose(
+        rays(half, 196, 259)[98, 129], rays(found, 392, 518)[196:198, 258:260].mean(axis=(0, 1))
+    )
+
+
+def test_a_perfect_map_has_errors_against_the_truth_of_published_tables(
+    views: dict[int, DepthView], tmp_path: Path
+) -> None:
+    bent = PROTOCOLS["points_7scenes"](tmp_path, Wall())
+    less = PROTOCOLS["points_nrgbd"](tmp_path, Wall())
+    exact = PROTOCOLS["points_indoor"](tmp_path, Wall())
+    assert bent["chamfer_m"] > less["chamfer_m"] > 100 * exact["chamfer_m"]
+
+
+def test_the_run_is_not_judged_with_its_own_intrinsics(
+    views: dict[int, DepthView], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = Wall()
+    unknown = replace(dataset.info, intrinsics=None)
+    monkeypatch.setattr(Wall, "info", unknown)
+    reason = PROTOCOLS["points_indoor"](tmp_path, dataset)["reason"]
+    assert reason == "the intrinsics of the true depth are unknown"
 
 
 # --- what a reader is told -----------------------------------------------------------------------

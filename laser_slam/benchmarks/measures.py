@@ -10,6 +10,7 @@ from typing import Any
 Scores = Mapping[str, Any]
 
 PROTOCOL_VERSION = 2  # rises when a protocol's numbers change, so that kept ones are not taken
+POINTS = ("indoor", "7scenes", "nrgbd", "outdoor")  # protocols of point maps
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,11 @@ MEASURES = {
     },
     **{
         f"{name}_pixels_percent": Measure(f"points_{name}", "coverage", 1, 100.0, True)
-        for name in ("indoor", "outdoor")
+        for name in POINTS
     },
     **{
         f"{name}_{measure}": Measure(f"points_{name}", path, 3, 1.0, path.startswith("nc"))
-        for name in ("indoor", "outdoor")
+        for name in POINTS
         for measure, path in (
             ("acc_m", "acc_mean_m"),
             ("acc_median_m", "acc_median_m"),

@@ -32,9 +32,14 @@ from laser_slam.sim3 import Sim3
 
 Depth = NDArray[np.float32]
 Array = NDArray[np.float64]
+Size = tuple[int, int]
 Protocol = Callable[[Path, Dataset], dict[str, Any]]
+Camera = Callable[[Array, Size, Size], Array]
+"""Intrinsics, size of the images and size of the map -> intrinsics of the map."""
 
 CALIBRATION = "calibration.yaml"
+PUBLISHED_SIZE = (392, 518)  # (height, width) of the truth that published maps of rooms meet
+FOCAL_READ_AS = 554.2562584220408 / 525  # 7-Scenes: the evaluation's focal length and the depth's
 
 
 def _views(folder: Path) -> Iterator[DepthView]:
@@ -49,10 +54,18 @@ class _Truth:
         folder: of the run.
         dataset: that it was run on.
         keep: chooses what of a map is compared, before anything is done to it.
+        bend: changes true intrinsics for a size as an evaluation does; None: it takes them as
+            they are.
     """
 
-    def __init__(self, folder: Path, dataset: Dataset, keep: Callable[[Depth], Depth]) -> None:
-        self._dataset, self._keep, self._rectifier = dataset, keep, None
+    def __init__(
+        self,
+        folder: Path,
+        dataset: Dataset,
+        keep: Callable[[Depth], Depth] = np.asarray,
+        bend: Camera | None = None,
+    ) -> None:
+        self._dataset, self._keep, self._bend, self._rectifier = dataset, keep, bend, None
         path = folder / CALIBRATION
         if path.exists():
             calibration = load_calibration(path)
@@ -67,17 +80,19 @@ class _Truth:
         kept = self._keep(truth)
         return kept if self._rectifier is None else self._rectifier.depth(kept)
 
-    def intrinsics(self, size: tuple[int, int], seen: Array) -> Array:
-        """Return the (3, 3) true ones for maps of (height, width), or ``seen``."""
+    def intrinsics(self, size: Size, seen: Array) -> Array:
+        """Return the (3, 3) true ones for maps of (height, width), or ``seen`` if rectified."""
         info = self._dataset.info
         if self._rectifier is not None or info.intrinsics is None:
             return seen
+        if self._bend is not None:
+            return self._bend(info.intrinsics, info.size, size)
         return resize_intrinsics(info.intrinsics, info.size, size)
 
 
 def _video_depth(protocol: VideoDepthProtocol) -> Protocol:
     def score(folder: Path, dataset: Dataset) -> dict[str, Any]:
-        known = _Truth(folder, dataset, lambda depth: depth)
+        known = _Truth(folder, dataset)
 
         def pairs() -> Iterator[tuple[Depth | None, Depth]]:
             for frame, view in _every_frame(folder, dataset):
@@ -90,13 +105,15 @@ def _video_depth(protocol: VideoDepthProtocol) -> Protocol:
     return score
 
 
-def _points(protocol: PointProtocol) -> Protocol:
+def _points(protocol: PointProtocol, bend: Camera | None = None) -> Protocol:
     def score(folder: Path, dataset: Dataset) -> dict[str, Any]:
         if dataset.info.truth is None:
             return {"reason": "no true poses"}
+        if dataset.info.intrinsics is None:  # those of the run would make it its own judge
+            return {"reason": "the intrinsics of the true depth are unknown"}
         if next(_views(folder), None) is None:
             return {"reason": "the run has no depth map"}
-        known = _Truth(folder, dataset, partial(comparable_depth, protocol=protocol))
+        known = _Truth(folder, dataset, partial(comparable_depth, protocol=protocol), bend)
         return asdict(evaluate_points(_point_maps(folder, dataset, known), protocol))
 
     return score
@@ -138,7 +155,27 @@ def _true_poses(dataset: Dataset) -> dict[int, Array]:
     return dict(zip(truth.frames.tolist(), truth.world_from_cam, strict=True))
 
 
-def _resized(depth: Depth, size: tuple[int, int]) -> Depth:
+def published_camera(intrinsics: Array, size: Size, new_size: Size, focal_as: float) -> Array:
+    """Return the camera with which pi3's and LASER's evaluations unproject the truth of rooms.
+
+    It belongs to maps of ``PUBLISHED_SIZE``. Both axes are scaled with the larger of the two
+    factors, and the focal length of 7-Scenes is that of NRGBD: the truth is bent, and a perfect
+    map has errors. Whoever is compared with their numbers must meet the same truth.
+
+    Args:
+        intrinsics: (3, 3) of the true depth.
+        size: (height, width) of it.
+        new_size: (height, width) of the map.
+        focal_as: what the focal length is multiplied with.
+    """
+    factor = max(new / old for new, old in zip(PUBLISHED_SIZE, size, strict=True))
+    bent = np.array(intrinsics, np.float64)
+    bent[[0, 1], [0, 1]] *= factor * focal_as
+    bent[:2, 2] = (bent[:2, 2] + 0.5) * factor - 0.5
+    return resize_intrinsics(bent, PUBLISHED_SIZE, new_size)
+
+
+def _resized(depth: Depth, size: Size) -> Depth:
     """Take the nearest pixels: means over depth edges would be no truth."""
     rows, columns = (_nearest(new, old) for new, old in zip(size, depth.shape, strict=True))
     return depth[np.ix_(rows, columns)]
@@ -159,6 +196,8 @@ def _unproject(depth: Depth, K: Array, world_from_cam: Array) -> Array:
 PROTOCOLS: dict[str, Protocol] = {
     **{f"video_depth_{name}": _video_depth(each) for name, each in VIDEO_DEPTH_PROTOCOLS.items()},
     "points_indoor": _points(INDOOR_POINTS),
+    "points_7scenes": _points(INDOOR_POINTS, partial(published_camera, focal_as=FOCAL_READ_AS)),
+    "points_nrgbd": _points(INDOOR_POINTS, partial(published_camera, focal_as=1.0)),
     "points_outdoor": _points(OUTDOOR_POINTS),
 }
 """Name -> scores of a finished run; their ``reason`` says why there are none."""
