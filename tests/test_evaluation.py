@@ -281,8 +281,7 @@ def test_one_length_of_kitti_is_close_to_evos_error_per_distance() -> None:
 
 @pytest.mark.skipif(DATA is None, reason="LASER_SLAM_DATA does not name the data folder")
 @pytest.mark.parametrize("sequence", ["03", "04", "07"])
-def test_real_drives_are_scored_as_kitti_and_evo_do(sequence: str) -> None:
-    metrics = pytest.importorskip("evo.core.metrics")
+def test_real_drives_are_scored_as_kitti_does(sequence: str) -> None:
     lines = np.loadtxt(Path(str(DATA)) / "kitti_gt_poses" / f"{sequence}.txt")
     true = np.tile(np.eye(4), (len(lines), 1, 1))
     true[:, :3] = lines.reshape(-1, 3, 4)
@@ -292,15 +291,9 @@ def test_real_drives_are_scored_as_kitti_and_evo_do(sequence: str) -> None:
     assert scores.scale is not None
     scaled = Sim3(scores.scale).apply_poses(estimate.world_from_cam)
     t_rel, r_rel, count = slow_kitti_errors(scaled, true)
-    assert scores.kitti.num_segments == count
-    assert scores.kitti.t_rel_percent == pytest.approx(t_rel, abs=1e-5)
-    # KITTI's six digits make its rotations orthonormal to 1e-6 only, which its acos magnifies.
-    assert scores.kitti.r_rel_deg_per_100m == pytest.approx(r_rel, rel=1e-3)
-    reference, found = evo_pair(estimate, truth)
-    found.align(reference, correct_scale=True)
-    ape = metrics.APE(metrics.PoseRelation.translation_part)
-    ape.process_data((reference, found))
-    np.testing.assert_allclose(scores.errors_m, ape.error, atol=1e-6)
+    assert scores.kitti.num_segments == count > 0
+    assert scores.kitti.t_rel_percent == pytest.approx(t_rel, abs=1e-6)
+    assert scores.kitti.r_rel_deg_per_100m == pytest.approx(r_rel, abs=1e-6)
 
 
 # --- depth ---------------------------------------------------------------------------------------
