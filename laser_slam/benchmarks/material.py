@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from laser_slam.config import Config
 from laser_slam.datasets import DATASETS
 from laser_slam.datasets.base import Dataset
 from laser_slam.dependencies import import_named
-from laser_slam.errors import DatasetError
+from laser_slam.errors import DatasetError, LaserSlamError
 
 ALONG_PATH = "path"  # a generated drive along true poses
 
@@ -32,34 +33,73 @@ class Material:
         Raises:
             LaserSlamError: it is not there, there is no reader for it, or it cannot be read.
         """
-        dataset = self._open(spec, config)
-        return dataset if spec.frames is None else Stretch(dataset, *spec.frames)
-
-    def _open(self, spec: SequenceSpec, config: Config) -> Dataset:
         if spec.reader == "synthetic":
-            return _make(spec, config.synthetic)
-        if spec.reader == ALONG_PATH:
-            from laser_slam.datasets.synthetic.drive import SyntheticDrive  # noqa: PLC0415
+            return _cut(_make(spec, config.synthetic), spec)
+        places = self._find(spec)
+        refusals: list[DatasetError] = []
+        for path, is_prepared in places:
+            try:
+                dataset = _open_at(spec, path, config)
+                return dataset if is_prepared else _cut(dataset, spec)
+            except DatasetError as error:
+                refusals.append(error)
+        if refusals:
+            raise DatasetError(_without_name(str(refusals[0]), spec)) from refusals[0]
+        raise DatasetError(_not_there(spec))
 
-            return SyntheticDrive.from_poses_file(self._find(spec), config.synthetic)
-        if spec.reader not in DATASETS:
-            raise DatasetError(f"laser-slam has no reader '{spec.reader}'")
-        return _make(spec, self._find(spec))
+    def look(self, spec: SequenceSpec, config: Config) -> tuple[int, str | None]:
+        """Return how many frames an input has, 0: not known, and why it cannot be read.
 
-    def _find(self, spec: SequenceSpec) -> Path:
+        What is generated is only looked for.
+        """
+        try:
+            if spec.reader in {ALONG_PATH, "synthetic"}:
+                is_there = spec.reader == "synthetic" or bool(self._find(spec))
+                return spec.num_frames or 0, None if is_there else _not_there(spec)
+            return self.open(spec, config).info.num_frames or 0, None
+        except LaserSlamError as error:
+            return 0, str(error)
+
+    def _find(self, spec: SequenceSpec) -> list[tuple[Path, bool]]:
+        """Return the places that are there, and whether they hold the chosen frames alone."""
         if self.root is None:
             raise DatasetError(
                 f"needs {spec.at[0]}; pass --data, or set LASER_SLAM_DATA, to the folder of it"
             )
-        for place in spec.at:
-            found = sorted(self.root.glob(place)) if "*" in place else [self.root / place]
-            for path in found:
-                if path.exists():
-                    return path
-        folders = [place.rpartition("/")[0] for place in spec.at if "/" in place] or spec.at
-        raise DatasetError(
-            f"not there, in {' or '.join(dict.fromkeys(folders))} of the data folder"
-        )
+        return [
+            (path, places is spec.prepared)
+            for places in (spec.at, spec.prepared)
+            for place in places
+            for path in (sorted(self.root.glob(place)) if "*" in place else [self.root / place])
+            if path.exists()
+        ]
+
+
+def _without_name(refusal: str, spec: SequenceSpec) -> str:
+    """Cut what differs between sequences that are missing alike, and options of other commands."""
+    what = refusal.partition("; pass --")[0]
+    for value in spec.arguments.values():
+        what = re.sub(rf" {re.escape(str(value))}\b", "", what, count=1)
+    return what
+
+
+def _not_there(spec: SequenceSpec) -> str:
+    folders = [place.rpartition("/")[0] for place in spec.at if "/" in place] or spec.at
+    return f"not there, in {' or '.join(dict.fromkeys(folders))} of the data folder"
+
+
+def _open_at(spec: SequenceSpec, path: Path, config: Config) -> Dataset:
+    if spec.reader == ALONG_PATH:
+        from laser_slam.datasets.synthetic.drive import SyntheticDrive  # noqa: PLC0415
+
+        return SyntheticDrive.from_poses_file(path, config.synthetic)
+    if spec.reader not in DATASETS:
+        raise DatasetError(f"laser-slam has no reader '{spec.reader}'")
+    return _make(spec, path)
+
+
+def _cut(dataset: Dataset, spec: SequenceSpec) -> Dataset:
+    return dataset if spec.frames is None else Stretch(dataset, *spec.frames)
 
 
 def _make(spec: SequenceSpec, source: object) -> Dataset:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from laser_slam import __version__
 from laser_slam.benchmarks.grid import Grid, fill_grids
-from laser_slam.benchmarks.printing import as_csv, as_markdown
-from laser_slam.benchmarks.runner import Outcome
+from laser_slam.benchmarks.outcome import Outcome
 from laser_slam.benchmarks.settings import Setting
 from laser_slam.benchmarks.table import Table
+from laser_slam.benchmarks.written import as_csv, as_markdown
 from laser_slam.errors import RunFolderError
 from laser_slam.store import write_text
 
@@ -21,24 +21,27 @@ HEAD = """# Results as they stand
 Written by `laser-slam bench`, each table by the command that stands in it; no number by hand.
 
 ```
-laser-slam bench TABLE --data DATA    # here, kitti, depth, pose, points, waymo, ablation
-laser-slam bench TABLE --data DATA --backbone pi3
-laser-slam bench TABLE --share --setting ours --setting short=windows.size=10,windows.overlap=3
-laser-slam bench TABLE --only 03,06 --page docs/results.md
+laser-slam bench                            # lists the tables
+laser-slam bench kitti --data DATA --list   # its rows and sequences, and which of them are there
+laser-slam bench kitti --data DATA          # runs them and prints the table; goes on if broken off
+laser-slam bench kitti --data DATA --only 03,06 --backbone pi3 --page docs/results.md
+laser-slam bench here --share --setting ours --setting short=windows.size=10,windows.overlap=3
+laser-slam bench my-table.yaml --data DATA  # a table of your own, written as the shipped ones are
 ```
 
 DATA holds the data sets as [datasets.md](datasets.md) describes them, each in a folder of its own
 (`kitti_odometry`, `7scenes`, `sintel`, `bonn`, `tum`, `scannet`, `nrgbd`, `waymo`, `kitti_depth`)
 or all in one. A row is a setting: its own `section.key=value` over those that all rows have. Each
-row of each sequence is a run with a folder of its own below `--out`; the same command goes on where
-it stopped and runs nothing twice. `--share` predicts windows once for all rows that cut the same;
-the backbone is then not asked about loops. `preset=vggt-long` in a row is VGGT-Long's registration
-and loops on the same backbone (the paper's "pi3-Long"), `preset=paper` and `preset=official` are
-the choices of the LASER paper and of its code.
+row of each sequence is a run with a folder of its own below `--out`, and no run is made twice.
+`--share` predicts windows once for all rows that cut the same; the backbone is then not asked about
+loops. `--lean` keeps scores, paths and report of each run, and neither windows nor map.
+`preset=vggt-long` in a row is VGGT-Long's registration and loops on the same backbone (the paper's
+"pi3-Long"), `preset=paper` and `preset=official` are the choices of LASER's paper and of its code.
 
-Rows whose source is "this run" were run by the command, all others are as their source has
-published them. A mean says over how many sequences it is where some have no number; a number with *
-is over a part of a sequence, and in no mean. Why, stands below the table.
+Rows in bold were run by the command, with the backbone in brackets; all others are as the source
+with that number has published them. The best number of a column is bold. A mean says over how many
+sequences it is where some have no number; a number with * is over a part of a sequence, and in no
+mean. The notes say why.
 """
 
 
@@ -62,26 +65,29 @@ class Report:
 
     def section(self, grids: Sequence[Grid]) -> str:
         """Write the table as a section of a page."""
-        rows = [
-            f"- **{setting.name}**: `{' '.join(setting.assignments) or 'no setting of its own'}`"
-            for setting in self.settings
-        ]
-        notes = [
-            f"- {name}: {spec.note}" for name, spec in self.table.sequences.items() if spec.note
-        ]
         common = " ".join(self.table.settings)
-        return "\n\n".join(
-            [
-                f"## {self.table.title}",
-                *([self.table.about.strip()] if self.table.about else []),
-                f"```\n{self.command}\n```",
-                f"By laser-slam {__version__}."
-                + (f" Settings of all rows: `{common}`." if common else ""),
-                "\n".join(rows),
-                *(["\n".join(notes)] if notes else []),
-                as_markdown(grids, self.outcomes),
-            ]
-        )
+        parts = [
+            f"## {self.table.title}",
+            self.table.about.strip(),
+            f"```\n{self.command}\n```",
+            f"By laser-slam {__version__}."
+            + (f" Settings of all rows: `{common}`." if common else ""),
+            "\n".join(self._rows()),
+            "\n".join(self._sequences()),
+            as_markdown(self.table, grids, self.outcomes),
+        ]
+        return "\n\n".join(part for part in parts if part)
+
+    def _rows(self) -> Iterator[str]:
+        for setting in self.settings:
+            own = f"`{' '.join(setting.assignments)}`" if setting.assignments else "as all rows are"
+            yield f"- **{setting.name}**: {own}"
+
+    def _sequences(self) -> Iterator[str]:
+        asked = {outcome.sequence for outcome in self.outcomes}
+        for name, spec in self.table.sequences.items():
+            if spec.note and name in asked:
+                yield f"- {name}: {spec.note}"
 
 
 def save_table(out: Path, report: Report, page: Path | None = None) -> list[Path]:

@@ -1,34 +1,29 @@
-"""Every row of a table on every sequence: run once, kept, and scored as the columns ask."""
+"""Every row of a table on every sequence, what is there before what must wait."""
 
 from __future__ import annotations
 
-import json
 import logging
+import shutil
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from laser_slam.benchmarks.claims import TakenError
 from laser_slam.benchmarks.material import Material
-from laser_slam.benchmarks.measures import MEASURES, Scores
-from laser_slam.benchmarks.protocols import PROTOCOLS
+from laser_slam.benchmarks.one import One, Place
+from laser_slam.benchmarks.outcome import NOT_YET, Outcome
+from laser_slam.benchmarks.pace import Pace, in_words
+from laser_slam.benchmarks.readiness import Readiness, refuse_unknown_names
 from laser_slam.benchmarks.settings import Setting
-from laser_slam.benchmarks.sharing import predict_once, replayed, shared_folder
 from laser_slam.benchmarks.table import Table
-from laser_slam.bookkeeping import Progress, identify, no_progress
+from laser_slam.bookkeeping import Progress, no_progress
 from laser_slam.config import Config, assigned, load_config
-from laser_slam.datasets.base import Dataset
-from laser_slam.errors import ConfigError, LaserSlamError, RunFolderError
-from laser_slam.pipeline import Pipeline
-from laser_slam.predicting import settle
-from laser_slam.predicting.manifest import read_identity
-from laser_slam.results import read_report
-from laser_slam.store import name_differences, write_text
+from laser_slam.errors import ConfigError
 
 logger = logging.getLogger(__name__)
 
-SCORES = "bench.json"  # in a run's folder: what protocols beyond the run itself have found
-RUN = "run"
+OnOutcomes = Callable[[list[Outcome]], object]
 
 
 def plain_settings(below: Sequence[str], above: Sequence[str]) -> Config:
@@ -36,23 +31,8 @@ def plain_settings(below: Sequence[str], above: Sequence[str]) -> Config:
     return load_config(assignments=above, base=assigned(below))
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of one row on one sequence.
-
-    Attributes:
-        setting: name of the row.
-        sequence: its name in the table.
-        scores: results by protocol; empty: it was not run.
-        reason: why there are none; None: there are.
-        part: which part of the sequence was there; None: the whole, or nobody knows.
-    """
-
-    setting: str
-    sequence: str
-    scores: Scores = field(default_factory=dict)
-    reason: str | None = None
-    part: str | None = None
+def keep_nothing(_outcomes: list[Outcome]) -> None:
+    """Do nothing with what is known so far."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +48,7 @@ class Bench:
         only: names of sequences or groups; none: all.
         is_shared: rows that cut the same windows map one prediction of them; the backbone is then
             not asked about loops.
+        is_lean: of a run that is scored, only scores, paths and report are kept.
     """
 
     table: Table
@@ -76,6 +57,7 @@ class Bench:
     resolve: Callable[[Sequence[str], Sequence[str]], Config] = plain_settings
     only: tuple[str, ...] = ()
     is_shared: bool = False
+    is_lean: bool = False
 
     def sequences(self) -> list[str]:
         """Return the names of the sequences that are run, in the table's order.
@@ -91,127 +73,129 @@ class Bench:
         wanted = {name for group in self.only for name in groups[group]}
         return [name for name in self.table.sequences if name in wanted or not self.only]
 
+    def runs(self, settings: Sequence[Setting]) -> list[One]:
+        """Return all runs in their order: all rows on the first sequence, then the next.
+
+        Raises:
+            LaserSlamError: a setting is unknown, or a sequence that is asked for is none.
+        """
+        place = Place(self.table, self.material, self.out, self.is_shared, self.is_lean)
+        runs = [
+            One(place, setting, name, self._config(setting, name))
+            for name in self.sequences()
+            for setting in settings
+        ]
+        for run in runs:
+            refuse_unknown_names(run.config)
+        return runs
+
     def run(
-        self, settings: Sequence[Setting], on_progress: Progress = no_progress
+        self,
+        settings: Sequence[Setting],
+        on_progress: Progress = no_progress,
+        on_outcomes: OnOutcomes = keep_nothing,
     ) -> list[Outcome]:
         """Run what has not been run yet, and score it; what fails becomes a reason.
 
         Args:
             settings: the rows.
             on_progress: called with a stage's name, how much is done and of how much.
+            on_outcomes: called after each run with all outcomes, those to come among them.
+
+        Returns:
+            Row by row, the sequences in the table's order.
 
         Raises:
             LaserSlamError: a setting is unknown, or a sequence that is asked for is none.
         """
-        sequences = self.sequences()
-        configs = {
-            (setting.name, name): self._config(setting, name)
-            for setting in settings
-            for name in sequences
-        }
-        outcomes = []
-        for setting in settings:
-            for name in sequences:
-                on_progress(f"bench {setting.name}", sequences.index(name), len(sequences))
-                one = _One(self, setting, name, configs[setting.name, name])
-                outcomes.append(one.outcome(on_progress))
-            on_progress(f"bench {setting.name}", len(sequences), len(sequences))
-        return outcomes
+        runs = self.runs(settings)
+        work = _Work(runs)
+        work.prepare()
+        for is_last in (False, True):  # what another process is at is looked at once more
+            for run in work.left():
+                on_progress("runs", len(work.done), len(runs))
+                if work.do(run, on_progress, is_last=is_last):
+                    on_outcomes(work.outcomes(settings))
+                self._drop_predictions(work, run.name)
+        on_progress("runs", len(runs), len(runs))
+        return work.outcomes(settings)
 
     def _config(self, setting: Setting, name: str) -> Config:
         spec = self.table.sequences[name]
         return self.resolve(self.table.settings, [*spec.settings, *setting.assignments])
 
+    def _drop_predictions(self, work: _Work, name: str) -> None:
+        """Remove shared predictions of a sequence of which all rows have their scores."""
+        runs = [run for run in work.runs if run.name == name]
+        if not (self.is_lean and self.is_shared and all(run.key in work.done for run in runs)):
+            return
+        if not any(work.done[run.key].reason for run in runs):
+            for folder in {run.shared for run in runs}:
+                shutil.rmtree(folder, ignore_errors=True)
 
-@dataclass(frozen=True)
-class _One:
-    """One row on one sequence."""
 
-    bench: Bench
-    setting: Setting
-    name: str
-    config: Config
+class _Work:
+    """Runs, what became of them, and how long the rest will take."""
 
-    @property
-    def folder(self) -> Path:
-        return self.bench.out / self.setting.folder / self.name
+    def __init__(self, runs: list[One]) -> None:
+        self.runs = runs
+        self.done: dict[tuple[str, str], Outcome] = {}
+        self._readiness = Readiness()
+        self._absent: dict[str, str] = {}
+        frames: dict[str, int] = {}
+        self._to_do: dict[tuple[str, str], One] = {}
+        for run in (run for run in runs if not run.is_finished):
+            if run.name not in {*frames, *self._absent}:
+                num, reason = run.place.material.look(run.spec, run.config)
+                if reason is None:
+                    frames[run.name] = num
+                else:
+                    self._absent[run.name] = reason
+            if run.name in frames:
+                self._to_do[run.key] = run
+        self._pace = Pace({key: frames[run.name] for key, run in self._to_do.items()})
 
-    def outcome(self, on_progress: Progress) -> Outcome:
+    def prepare(self) -> None:
+        """Say what will be done, and find out before the first run what cannot be."""
+        num_without = sum(run.name in self._absent and not run.is_finished for run in self.runs)
+        num, num_left = len(self.runs), len(self._to_do)
+        logger.info(
+            "%d runs: %d finished before, %d without data, %d to go",
+            num, num - num_without - num_left, num_without, num_left,
+        )  # fmt: skip
+        for reason in dict.fromkeys(self._absent.values()):
+            names = ", ".join(name for name, why in self._absent.items() if why == reason)
+            logger.warning("%s: %s", names, reason)
+        self._readiness.check(run.config for run in self._to_do.values())
+
+    def left(self) -> list[One]:
+        """Return what has not been looked at."""
+        return [run for run in self.runs if run.key not in self.done]
+
+    def do(self, run: One, on_progress: Progress, *, is_last: bool) -> bool:
+        """Have a run's outcome, unless another process is at it; tell whether it is a new one."""
+        is_new, reason = run.key in self._to_do, None
+        if not run.is_finished:
+            reason = self._absent.get(run.name) or self._readiness.why_not(run.config)
+        start_s = time.monotonic()
         try:
-            spec = self.bench.table.sequences[self.name]
-            dataset = self.bench.material.open(spec, self.config)
-            scores = self._scores(dataset, on_progress)
-        except LaserSlamError as error:
-            logger.warning("%s, %s: %s", self.setting.name, self.name, error)
-            return Outcome(self.setting.name, self.name, reason=self._portable(str(error)))
-        except (MemoryError, RuntimeError, OSError) as error:  # a GPU's memory is a RuntimeError
-            logger.exception("%s, %s broke off", self.setting.name, self.name)
-            reason = f"{type(error).__name__}: {' '.join(str(error).split())}"[:200]
-            return Outcome(self.setting.name, self.name, reason=self._portable(reason))
-        num, whole = dataset.info.num_frames, spec.num_frames
-        part = f"{num} of {whole} frames" if num and whole and num < whole else None
-        return Outcome(self.setting.name, self.name, scores, part=part)
+            found = run.without(reason) if reason else run.outcome(self._readiness, on_progress)
+        except TakenError as error:
+            if is_last:
+                self.done[run.key] = run.without(f"{error}: run this again when it has ended")
+            return False
+        self.done[run.key] = found
+        if is_new and not found.reason:
+            seconds = time.monotonic() - start_s
+            self._pace.note(run.key, seconds)
+            row, name = run.key
+            logger.info("%s, %s: %s; %s", row, name, in_words(seconds), self._pace.left())
+            return True
+        self._pace.drop(run.key)
+        return is_new and not reason
 
-    def _portable(self, text: str) -> str:
-        """Name folders as anybody may, who makes the same table elsewhere."""
-        places = {self.bench.out: "RUNS", self.bench.material.root: "DATA"}
-        for place, word in places.items():
-            if place is not None and place != Path():
-                text = text.replace(str(place), word)
-        return text
-
-    def _scores(self, dataset: Dataset, on_progress: Progress) -> dict[str, Any]:
-        config = self.config
-        if self.bench.is_shared:
-            shared = shared_folder(config, self.bench.out, self.name)
-            config = replayed(config, shared)
-        if (self.folder / "report.json").exists():
-            self._refuse_another_run(dataset, config)
-        else:
-            if self.bench.is_shared:
-                predict_once(dataset, self.config, shared, on_progress)
-            Pipeline(dataset, config, self.folder, on_progress=on_progress).run()
-        scores = _read_scores(self.folder / SCORES)
-        wanted = {MEASURES[name].protocol for name in self.bench.table.measures_of(self.name)}
-        for protocol in sorted(wanted - scores.keys() - {RUN}):
-            scores[protocol] = PROTOCOLS[protocol](self.folder, dataset)
-            write_text(self.folder / SCORES, json.dumps(scores, indent=2) + "\n")
-        return {**scores, RUN: _numbers(self.folder)}
-
-    def _refuse_another_run(self, dataset: Dataset, config: Config) -> None:
-        """Refuse a finished run whose settings or input are not those of the row."""
-        settings = load_config(file=self.folder / "config.yaml").model_dump(mode="json")
-        wanted = settle(config, dataset.info, self.folder).model_dump(mode="json")
-        pairs = {
-            "settings": (settings, wanted),
-            "input": (read_identity(self.folder), identify(dataset)),
-        }
-        for what, (stored, now) in pairs.items():
-            differences = name_differences(stored, now)
-            if differences:
-                raise RunFolderError(
-                    f"{self.folder} holds a run with other {what}: {differences}; remove it, or "
-                    "choose another folder with --out"
-                )
-
-
-def _numbers(folder: Path) -> dict[str, Any]:
-    """Read the report, without what a table has no use for."""
-    report = dict(read_report(folder))
-    windows = report.get("windows") or {}
-    num_bridged = len(windows.get("bridged") or ())
-    kept = ("trajectory", "depth", "closures", "frames", "frames_per_second")
-    numbers = {name: report.get(name) for name in kept}
-    return {**numbers, "windows": {"num": windows.get("num"), "num_bridged": num_bridged}}
-
-
-def _read_scores(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        return {}
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RunFolderError(
-            f"cannot read {path}; remove it, it will be worked out anew"
-        ) from error
-    return found if isinstance(found, dict) else {}
+    def outcomes(self, settings: Sequence[Setting]) -> list[Outcome]:
+        """Return the outcomes of all runs row by row; what has none says that it is to come."""
+        found = {run.key: self.done.get(run.key) or run.without(NOT_YET) for run in self.runs}
+        order = [setting.name for setting in settings]
+        return sorted(found.values(), key=lambda outcome: order.index(outcome.setting))

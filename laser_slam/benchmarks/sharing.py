@@ -6,6 +6,7 @@ import hashlib
 import json
 from pathlib import Path
 
+from laser_slam.backbones.base import Backbone
 from laser_slam.bookkeeping import Progress
 from laser_slam.config import Config, ReplayConfig
 from laser_slam.datasets.base import Dataset
@@ -34,14 +35,28 @@ def shared_folder(config: Config, out: Path, sequence: str) -> Path:
     return out / FOLDER / f"{sequence}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def predict_once(dataset: Dataset, config: Config, folder: Path, on_progress: Progress) -> None:
+def predict_once(
+    dataset: Dataset,
+    config: Config,
+    folder: Path,
+    backbone: Backbone | None,
+    on_progress: Progress,
+) -> None:
     """Predict the windows of a row into ``folder``, or what is missing of them.
+
+    Args:
+        dataset: the input.
+        config: of the row.
+        folder: of the predictions.
+        backbone: that predicts; None: one is made as the settings say.
+        on_progress: called with a stage's name, how much is done and of how much.
 
     Raises:
         LaserSlamError: the input, the settings or the folder cannot be used.
     """
     matters = {name: getattr(config, name) for name in (*SECTIONS, "backbone", "synthetic")}
-    Job(dataset, Config(**matters), folder, on_progress=on_progress).run()
+    settings = Config(**matters)
+    Job(dataset, settings, folder, backbone=backbone, on_progress=on_progress).run()
 
 
 def replayed(config: Config, folder: Path) -> Config:

@@ -4,15 +4,47 @@ from __future__ import annotations
 
 import difflib
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 
 from laser_slam.benchmarks.measures import MEASURES
 from laser_slam.errors import ConfigError
 
 FOLDER = Path(__file__).parent / "tables"
+
+
+class _Printed(float):
+    """A number that knows how it was printed: 9.50 is not 9.5."""
+
+    text: str
+
+
+class _AsPrinted(yaml.SafeLoader):
+    """Reads YAML whose numbers know how they were printed."""
+
+
+def _read_number(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> _Printed:
+    number = _Printed(loader.construct_yaml_float(node))
+    number.text = str(node.value)
+    return number
+
+
+_AsPrinted.add_constructor("tag:yaml.org,2002:float", _read_number)
+
+
+def _as_printed(value: object) -> object:
+    if isinstance(value, int | float):
+        return getattr(value, "text", str(value))
+    return value
 
 
 class _Part(BaseModel):
@@ -25,7 +57,9 @@ class SequenceSpec(_Part):
     Attributes:
         reader: name in ``laser_slam.datasets.DATASETS``, or ``path``: a drive along true poses.
         at: places below the data folder where it may lie, with ``*`` for any part of a name; the
-            first that is there is taken; none: it needs no data.
+            first that can be read is taken; none: it needs no data.
+        prepared: such places that hold the chosen frames alone, to which ``frames`` does not
+            apply; they are looked at last.
         arguments: of the reader, after the place.
         frames: first, end and step of the frames that are used, as a slice; none: all.
         num_frames: that there should be; of fewer, what is measured says so; None: not known.
@@ -35,6 +69,7 @@ class SequenceSpec(_Part):
 
     reader: str
     at: tuple[str, ...] = ()
+    prepared: tuple[str, ...] = ()
     arguments: dict[str, Any] = {}
     frames: tuple[int, int | None, int] | None = None
     num_frames: int | None = None
@@ -56,11 +91,11 @@ class Column(_Part):
 
 
 class Published(_Part):
-    """A row that others have published: a value for each column, a word, or None."""
+    """A row that others have published: for each column a number as printed, a word, or None."""
 
     method: str
     source: str
-    values: tuple[float | str | None, ...]
+    values: tuple[Annotated[str | None, BeforeValidator(_as_printed)], ...]
 
 
 class Block(_Part):
@@ -145,26 +180,49 @@ def table_names() -> list[str]:
 
 
 def load_table(name: str) -> Table:
-    """Read a table by its name.
+    """Read a table by its name, or one of the user's by its path.
 
     Raises:
-        ConfigError: there is no such table.
+        ConfigError: there is no such table, or it is none.
     """
-    names = table_names()
-    if name not in names:
-        near = difflib.get_close_matches(name, names, n=1)
-        hint = f" (did you mean {near[0]}?)" if near else ""
-        raise ConfigError(f"no table '{name}'{hint}; there is {', '.join(names)}")
-    return parse_table((FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
+    if name in table_names():
+        return parse_table((FOLDER / f"{name}.yaml").read_text(encoding="utf-8"))
+    path = Path(name)
+    if path.suffix in {".yaml", ".yml"}:
+        try:
+            return parse_table(path.read_text(encoding="utf-8"), name)
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"cannot read the table {name}: {error}") from error
+    near = difflib.get_close_matches(name, table_names(), n=1)
+    hint = f" (did you mean {near[0]}?)" if near else ""
+    raise ConfigError(
+        f"no table '{name}'{hint}; there is {', '.join(table_names())}, or give the path of a "
+        "YAML file of your own"
+    )
 
 
-def parse_table(text: str) -> Table:
+def parse_table(text: str, name: str = "table") -> Table:
     """Read a table from YAML.
+
+    Args:
+        text: YAML.
+        name: of the file, for the error.
 
     Raises:
         ConfigError: it is no table.
     """
     try:
-        return Table.model_validate(yaml.safe_load(text))
-    except (yaml.YAMLError, ValidationError) as error:
-        raise ConfigError(f"not a table: {' '.join(str(error).split())}") from error
+        return Table.model_validate(yaml.load(text, _AsPrinted))
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{name} is no YAML: {' '.join(str(error).split())}") from error
+    except ValidationError as error:
+        raise ConfigError(f"{name}: {_explain(error)}") from error
+
+
+def _explain(error: ValidationError) -> str:
+    """Name the first things that are wrong, and where."""
+    parts = []
+    for item in error.errors()[:3]:
+        place = ".".join(str(part) for part in item["loc"])
+        parts.append(f"{place}: {item['msg']}" if place else str(item["msg"]))
+    return "; ".join(parts).replace("Value error, ", "")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from laser_slam.cli.app import (
+    INTERRUPTED,
     BackboneOption,
     ConfigOption,
     QuietOption,
@@ -20,15 +21,22 @@ from laser_slam.cli.app import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
+    from laser_slam.benchmarks import Bench, Outcome, Setting
     from laser_slam.config import Config
 
 WIDTH = 200  # of what is printed to no terminal
 
 DataOption = Annotated[
     Path | None,
-    typer.Option("--data", envvar="LASER_SLAM_DATA", help="Folder that holds the data sets."),
+    typer.Option(
+        "--data",
+        envvar="LASER_SLAM_DATA",
+        exists=True,
+        file_okay=False,
+        help="Folder that holds the data sets.",
+    ),
 ]
 SettingOption = Annotated[
     list[str] | None,
@@ -49,9 +57,26 @@ ShareOption = Annotated[
         "asked about loops then.",
     ),
 ]
+LeanOption = Annotated[
+    bool,
+    typer.Option(
+        "--lean",
+        help="Keep scores, paths and report of each run; remove its windows, layers and map.",
+    ),
+]
+ListOption = Annotated[
+    bool,
+    typer.Option(
+        "--list", help="Show rows and sequences, and which are there and finished; run nothing."
+    ),
+]
 OutOption = Annotated[
     Path | None,
-    typer.Option("--out", help="Holds all runs; goes on where it stopped. [runs/TABLE]"),
+    typer.Option(
+        "--out",
+        help="Holds all runs; the same command goes on where it stopped, and several may work at "
+        "once. [runs/TABLE]",
+    ),
 ]
 PageOption = Annotated[
     Path | None, typer.Option("--page", help="Markdown page whose section of the table is renewed.")
@@ -66,6 +91,8 @@ class BenchFlags:
     setting: SettingOption = None
     only: OnlyOption = None
     share: ShareOption = False
+    lean: LeanOption = False
+    list: ListOption = False
     backbone: BackboneOption = None
     config: ConfigOption = None
     set: SetOption = None
@@ -93,44 +120,94 @@ class BenchFlags:
             parts += [] if value is None else [flag, value]
         for flag, values in (("--setting", self.setting), ("--set", self.set)):
             parts += [part for value in values or [] for part in (flag, value)]
-        parts += ["--share"] if self.share else []
+        parts += [
+            flag for flag, is_set in (("--share", self.share), ("--lean", self.lean)) if is_set
+        ]
         return shlex.join(parts) + ("" if self.data is None else " --data DATA")
 
 
 @functools.partial(command, options=BenchFlags)
 def bench(
-    table: Annotated[
-        str,
-        typer.Argument(metavar="TABLE", help="here, kitti, depth, pose, points, waymo, ablation."),
-    ],
     options: BenchFlags,
+    table: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[TABLE]",
+            help="here, kitti, depth, pose, points, waymo or ablation; a YAML file of your own; "
+            "none: list them.",
+        ),
+    ] = None,
 ) -> None:
     """Run a whole table of the paper, and print it beside what others have published."""
+    from laser_slam.benchmarks import Bench, Material, list_tables, load_table, parse_settings
+
+    if table is None:
+        _print_pairs("Tables, each for laser-slam bench TABLE", list_tables())
+        return
+    chosen = load_table(table)
+    out = options.out or Path("runs") / Path(table).stem
+    settings = parse_settings(options.setting or [], chosen)
+    only = tuple(part.strip() for part in (options.only or "").split(",") if part.strip())
+    material = Material(options.data)
+    work = Bench(chosen, material, out, options.resolve, only, options.share, options.lean)
+    if options.list:
+        _show_plan(work, settings)
+        return
+    _run(work, settings, Path(table), options)
+
+
+def _run(work: Bench, settings: Sequence[Setting], table: Path, options: BenchFlags) -> None:
+    """Run the table, keep what is known after each run, print it at the end."""
     from rich.console import Console
 
-    from laser_slam.benchmarks import (
-        Bench,
-        Material,
-        Report,
-        fill_grids,
-        load_table,
-        parse_settings,
-        print_grids,
-        save_table,
-    )
+    from laser_slam.benchmarks import Report, fill_grids, print_grids, save_table
     from laser_slam.console import progress_display
 
-    chosen = load_table(table)
-    settings = parse_settings(options.setting or [], chosen)
-    out = options.out or Path("runs") / table
-    only = tuple(part.strip() for part in (options.only or "").split(",") if part.strip())
-    work = Bench(chosen, Material(options.data), out, options.resolve, only, options.share)
-    with progress_display(quiet=options.quiet) as on_progress:
-        outcomes = work.run(settings, on_progress)
+    def save(outcomes: Sequence[Outcome], page: Path | None = None) -> list[Path]:
+        command = options.command(table.name)
+        report = Report(table.stem, work.table, settings, outcomes, command)
+        return save_table(work.out, report, page)
+
+    try:
+        with progress_display(quiet=options.quiet) as on_progress:
+            outcomes = work.run(settings, on_progress, save)
+    except KeyboardInterrupt as error:
+        runs = work.runs(settings)
+        num = sum(run.is_finished for run in runs)
+        typer.echo(
+            f"laser-slam: interrupted; {num} of {len(runs)} runs are finished in {work.out}; "
+            "the same command goes on",
+            err=True,
+        )
+        raise typer.Exit(INTERRUPTED) from error
     console = Console()
     if not console.is_terminal:
         console.width = max(console.width, WIDTH)
-    print_grids(fill_grids(chosen, outcomes), outcomes, console)
-    report = Report(table, chosen, settings, outcomes, options.command(table))
-    for path in save_table(out, report, options.page):
+    print_grids(work.table, fill_grids(work.table, outcomes), outcomes, console)
+    for path in save(outcomes, options.page):
         typer.echo(path)
+    if not any(outcome.scores for outcome in outcomes):
+        typer.echo("laser-slam: no row has a number; the notes say why", err=True)
+        raise typer.Exit(1)
+
+
+def _show_plan(work: Bench, settings: Sequence[Setting]) -> None:
+    from laser_slam.benchmarks import list_groups, list_rows, list_sequences
+
+    typer.echo(f"{work.table.title}\n\n{work.table.about.strip()}\n")
+    _print_pairs("Rows", list_rows(settings))
+    _print_pairs("Groups, for --only", list_groups(work))
+    _print_pairs("Sequences", list_sequences(work, settings))
+
+
+def _print_pairs(title: str, pairs: Iterable[tuple[str, str]]) -> None:
+    from rich.console import Console
+    from rich.table import Table as Drawn
+    from rich.text import Text
+
+    drawn = Drawn(title=Text(title, style="bold"), title_justify="left", box=None)
+    drawn.show_header = False
+    for pair in pairs:
+        drawn.add_row(*map(Text, pair))
+    if drawn.row_count:
+        Console().print(drawn)
