@@ -213,10 +213,6 @@ def test_depth_that_was_moved_to_the_colour_camera_is_taken_with_its_focal_lengt
     assert ".depth.proj.png" in moved.info.intrinsics_source
     (folder / "frame-000001.depth.proj.png").unlink()
     assert SevenScenes(folder).true_depth(1) is None  # two kinds do not mix
-    published = SevenScenes(folder, focal_px=554.2562584220408).info
-    assert published.intrinsics is not None
-    assert published.intrinsics[1, 1] == pytest.approx(554.2562584220408 * SIZE[0] / 480)
-    assert "given" in published.intrinsics_source
     for path in folder.glob("*.proj.png"):
         path.unlink()
     raw = SevenScenes(folder)

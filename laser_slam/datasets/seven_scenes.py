@@ -14,12 +14,18 @@ from laser_slam.datasets.poses import read_pose
 from laser_slam.errors import DatasetError
 
 FPS = 30.0
-SIZE, CENTRE = (480, 640), (320.0, 240.0)
 RAW, MOVED = "depth.png", "depth.proj.png"  # of the depth camera; moved to the colour camera
-FOCALS_PX = {RAW: 585.0, MOVED: 525.0}  # of the official page; of the script that moves
-SOURCES = {
-    RAW: "7-Scenes, nominal of the depth camera",
-    MOVED: "7-Scenes, of the colour camera that .depth.proj.png was moved to",
+LENSES = {
+    RAW: Lens(  # of the official page
+        intrinsics_matrix(585.0, 585.0, 320.0, 240.0),
+        "7-Scenes, nominal of the depth camera",
+        (480, 640),
+    ),
+    MOVED: Lens(  # of the script that moves
+        intrinsics_matrix(525.0, 525.0, 320.0, 240.0),
+        "7-Scenes, of the colour camera that .depth.proj.png was moved to",
+        (480, 640),
+    ),
 }
 UNITS_PER_M = 1000.0
 INVALID = (0, 65535)
@@ -42,8 +48,6 @@ class SevenScenes(ListedSequence):
 
     Args:
         folder: of one sequence, such as ``redkitchen/seq-03``.
-        focal_px: focal length in pixels at 640x480, for another one; LASER's evaluation has
-            554.2562584220408, which is NRGBD's. None: that of the depth.
 
     Raises:
         DatasetError: no such images there, images of several sizes, or a pose file that does not
@@ -52,7 +56,7 @@ class SevenScenes(ListedSequence):
 
     again = AGAIN
 
-    def __init__(self, folder: Path, *, focal_px: float | None = None) -> None:
+    def __init__(self, folder: Path) -> None:
         named = folder.resolve()
         frames = _list_frames(folder)
         is_moved = any(_beside(path, MOVED).is_file() for path in frames.values())
@@ -60,16 +64,9 @@ class SevenScenes(ListedSequence):
         super().__init__(
             f"7scenes-{named.parent.name}-{named.name}",
             [_shot(number, path, depth) for number, path in frames.items()],
-            _lens(depth, focal_px),
+            LENSES[depth],
             partial(read_depth, units_per_m=UNITS_PER_M, advice=AGAIN, invalid=INVALID),
         )
-
-
-def _lens(depth: str, focal_px: float | None) -> Lens:
-    focal, source = FOCALS_PX[depth], SOURCES[depth]
-    if focal_px is not None:
-        focal, source = focal_px, f"given, with the depth of .{depth}"
-    return Lens(intrinsics_matrix(focal, focal, *CENTRE), source, SIZE)
 
 
 def _shot(number: int, color: Path, ending: str) -> Shot:
