@@ -65,13 +65,18 @@ def cam0_from_cam() -> Array:
 
 def cast(origins: Array, directions: Array) -> Array:
     """Return how many (..., 3) directions away from their origins the world begins; inf: sky."""
-    origins = np.broadcast_to(origins, directions.shape)
+    origin = [origins[..., axis] for axis in range(3)]  # one axis at a time is much faster
     with np.errstate(divide="ignore", invalid="ignore"):
-        ground = (GROUND_M - origins[..., 1]) / directions[..., 1]
+        per_way = [1 / np.ascontiguousarray(directions[..., axis]) for axis in range(3)]
+        ground = (GROUND_M - origin[1]) * per_way[1]
         far = np.where(ground > 0, ground, np.inf)
         for low, high in zip(LOWS, HIGHS, strict=True):
-            pair = np.stack([low - origins, high - origins]) / directions
-            enter, leave = pair.min(axis=0).max(axis=-1), pair.max(axis=0).min(axis=-1)
+            enter, leave = np.float64(-np.inf), np.float64(np.inf)
+            for axis in range(3):
+                one = (low[axis] - origin[axis]) * per_way[axis]
+                other = (high[axis] - origin[axis]) * per_way[axis]
+                enter = np.maximum(enter, np.minimum(one, other))
+                leave = np.minimum(leave, np.maximum(one, other))
             far = np.where((enter > 0) & (enter < leave), np.minimum(far, enter), far)
     return np.asarray(far)
 
@@ -128,6 +133,53 @@ def _seen_at(world: Array, frames: Array) -> Array:
     return np.asarray(turned + velo_from_world[rows, :3, 3])
 
 
+def surface_scan(frame: int) -> Array:
+    """Return which of some fixed points on all surfaces the scanner sees, in its axes.
+
+    Rings on a bare road tell a registration that nothing moved; these points tell all, and lie
+    where the camera sees something.
+    """
+    world_from_velo = true_pose(frame) @ cam0_from_velo()
+    ways = SURFACE - world_from_velo[:3, 3]
+    far = np.linalg.norm(ways, axis=1)
+    ways, far = ways[far < REACH_M], far[far < REACH_M]
+    is_seen = np.abs(cast(world_from_velo[:3, 3], ways / far[:, None]) - far) < 1e-6
+    return np.asarray(ways[is_seen] @ world_from_velo[:3, :3])
+
+
+def _surface() -> Array:
+    """Draw points evenly on the faces of the boxes and, fewer, on the road."""
+    parts = []
+    for low, high in zip(LOWS, HIGHS, strict=True):
+        size = high - low
+        for axis in range(3):
+            area = size.prod() / size[axis]
+            for end in (low, high):
+                points = _RNG.uniform(low, high, (int(POINTS_PER_M2 * min(area, 60)), 3))
+                points[:, axis] = end[axis]
+                parts.append(points)
+    road = _RNG.uniform([-12, GROUND_M, -30], [12, GROUND_M, 68], (6_000, 3))
+    points = np.concatenate([*parts, road])
+    return np.asarray(points[points[:, 1] <= GROUND_M])
+
+
+POINTS_PER_M2 = 15
+REACH_M = 40.0
+SURFACE = _surface()
+
+
+def view(frame: int) -> Array:
+    """Return the (H, W, 3) image of the second camera: colours that go with the place."""
+    world_from_cam = true_pose(frame) @ cam0_from_cam()
+    directions = rays(INTRINSICS, *SIZE) @ world_from_cam[:3, :3].T
+    depth = np.minimum(true_depth(frame), 500.0)
+    points = world_from_cam[:3, 3] + directions * depth[..., None]
+    waves = [np.sin(points @ np.array(w)) for w in ((3, 2, 1), (7, 5, -6), (1.1, 0.7, 0.9))]
+    grey = 128 + 40 * sum(waves)
+    colors = np.stack([grey, grey * 0.9, 255 - grey], axis=-1)
+    return np.asarray(np.clip(colors, 0, 255), np.uint8)
+
+
 def write_scan(path: Path, points: Array) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     stored = np.zeros((len(points), 4), "<f4")
@@ -141,11 +193,21 @@ def projection() -> Array:
     return np.asarray(INTRINSICS @ cam_from_cam0[:3])
 
 
-def write_kitti(root: Path, num: int = NUM, take: Callable[[int], Array] = landmarks) -> Path:
-    """Write KITTI odometry's layout with scans; the images are plain."""
+def plain(frame: int) -> Array:
+    """Return an image of one grey."""
+    return np.full((*SIZE, 3), 20 * frame, np.uint8)
+
+
+def write_kitti(
+    root: Path,
+    num: int = NUM,
+    take: Callable[[int], Array] = landmarks,
+    look: Callable[[int], Array] = plain,
+) -> Path:
+    """Write KITTI odometry's layout with scans."""
     folder = root / "sequences" / "00"
     for frame in range(num):
-        write_png(folder / f"image_2/{frame:06d}.png", np.full((*SIZE, 3), 20 * frame, np.uint8))
+        write_png(folder / f"image_2/{frame:06d}.png", look(frame))
         write_scan(folder / f"velodyne/{frame:06d}.bin", take(frame))
     rows = {"P2": projection(), "Tr": cam0_from_velo()[:3]}
     (folder / "calib.txt").write_text("".join(map(_row, rows.items())))
