@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from laser_slam.benchmarks import Bench, Material, Setting, fill_grids, load_table
 from laser_slam.camera import intrinsics_matrix, unproject
-from laser_slam.config import BackboneConfig
+from laser_slam.config import BackboneConfig, load_config
 from laser_slam.datasets.synthetic.paths import loop_path
 from laser_slam.datasets.synthetic.render import Renderer
 from laser_slam.datasets.synthetic.world import build_world
@@ -397,6 +397,54 @@ def test_the_table_of_kitti_scores_nothing_for_the_truth_and_the_known_lift(scor
     assert right["r_rel_deg_per_100m"] < 0.005
     wrong = score("kitti", "04", BENT_POSES)
     assert wrong["ate_m"] == pytest.approx(LIFT * step_m(CASES["kitti", "04"].scene), rel=0.01)
+
+
+MONST3R: dict[tuple[str, str], tuple[str, Callable[[Path], Path]]] = {
+    ("depth", "bonn-balloon2"): (
+        "rgbd_bonn_dataset/rgbd_bonn_balloon2",
+        lambda folder: layouts.choose_bonn(folder, 30, 110),
+    ),
+    ("depth", "kitti-09-26-0002"): (
+        "kitti/val/2011_09_26_drive_0002_sync",
+        lambda folder: layouts.choose_kitti_depth(folder, 110),
+    ),
+    ("pose", "scannet-scene0707_00"): (
+        "scannetv2/scene0707_00",
+        lambda folder: layouts.choose_scannet(folder, 3, 22),
+    ),
+    ("pose", "tum-sitting_static"): (
+        "tum/rgbd_dataset_freiburg3_sitting_static",
+        lambda folder: layouts.choose_tum(folder, 3, 90),
+    ),
+}
+
+
+@pytest.mark.parametrize("which", MONST3R)
+def test_who_has_only_what_monst3r_chose_gets_the_frames_of_the_table(
+    which: tuple[str, str], data: Path, tmp_path: Path
+) -> None:
+    """The table picks frames of a whole sequence; of the chosen ones it must not pick again."""
+    case, (place, choose) = CASES[which], MONST3R[which]
+    case.write(tmp_path / place, case.num, case.scene)
+    chosen = choose(tmp_path / place)
+    for name in ("rgb.txt", "color", "proj_depth"):  # without which it is no whole sequence
+        if (tmp_path / place / name).exists():
+            (tmp_path / place / name).rename(tmp_path / "away")
+    spec = load_table(which[0]).sequences[which[1]]
+    whole, found = (Material(root).open(spec, load_config()) for root in (data, tmp_path))
+    assert chosen == found.info.files[0].parent
+    assert whole.info.num_frames == found.info.num_frames == len(case.used)
+    for one, other in zip(whole.frames(), found.frames(), strict=True):
+        np.testing.assert_array_equal(one.image, other.image)
+        np.testing.assert_array_equal(
+            whole.true_depth(one.index), found.true_depth(other.index), strict=True
+        )
+    truth, same = whole.info.truth, found.info.truth
+    if truth is None or same is None:
+        assert truth is same
+        return
+    assert truth.frames.tolist() == same.frames.tolist()
+    np.testing.assert_allclose(truth.world_from_cam, same.world_from_cam, atol=1e-9)
 
 
 def test_all_nine_data_sets_of_the_paper_go_through_their_tables() -> None:
