@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from rich.box import HORIZONTALS
 from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table as Drawn
@@ -15,7 +16,7 @@ from laser_slam.benchmarks.outcome import Outcome
 from laser_slam.benchmarks.sources import Sources
 from laser_slam.benchmarks.table import Table
 
-_BESIDE = 3  # characters between columns
+_BESIDE = 2  # characters between columns
 _BEST = "bold green"
 
 
@@ -42,7 +43,7 @@ def print_grids(
 
 def _draw(grid: Grid, names: Sequence[Text], piece: range) -> Drawn:
     """Draw some of a block's columns."""
-    drawn = Drawn(show_edge=False)
+    drawn = Drawn(show_edge=False, box=HORIZONTALS, padding=(0, 1, 0, 0), pad_edge=False)
     drawn.add_column(grid.label, no_wrap=True)
     for place in piece:
         drawn.add_column(grid.header(grid.columns[place]), justify="right", no_wrap=True)

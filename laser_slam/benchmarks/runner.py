@@ -174,7 +174,7 @@ class _Work:
 
     def do(self, run: One, on_progress: Progress, *, is_last: bool) -> bool:
         """Have a run's outcome, unless another process is at it; tell whether it is a new one."""
-        is_new, reason = run.key in self._to_do, None
+        is_new, reason = run.key in self._to_do and not run.is_finished, None
         if not run.is_finished:
             reason = self._absent.get(run.name) or self._readiness.why_not(run.config)
         start_s = time.monotonic()
