@@ -175,6 +175,7 @@ def test_the_images_that_monst3r_takes_of_kitti_depth_are_read_from_either_side(
         dataset = KittiDepth(chosen.parent.with_name(name) / chosen.name)
         assert seen(dataset) == [0, 1, 2, 3, 4]
         assert_truth(dataset, [0, 1, 2, 3, 4], 256)
+        assert dataset.info.name == LAYOUTS["kitti-depth"].name
 
 
 def official_association(first: list[float], second: list[float]) -> dict[int, int]:

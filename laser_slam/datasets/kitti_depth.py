@@ -16,7 +16,7 @@ RATE_HZ = 10.0
 CAMERA = "image_02"  # left colour
 ROW = "P_rect_02"  # its projection
 AGAIN = "unpack data_depth_annotated and the raw drive again"
-GATHERED = ("groundtruth_depth_gathered", "image_gathered")  # MonST3R's copy of the first 110
+GATHERED = ("groundtruth_depth_gathered", "image_gathered")  # what published evaluations copy
 
 
 class KittiDepth(ListedSequence):
@@ -26,7 +26,8 @@ class KittiDepth(ListedSequence):
     five. Depth is 16 bits, metres times 256, 0: unknown. The raw images are looked for as
     ``DRIVE/image_02/data`` in the given folder, in the drive's own, and in ``raw`` beside ``val``,
     with or without the day's folder (``2011_09_26``), where the calibration is read from.
-    A folder of ``groundtruth_depth_gathered`` with its twin in ``image_gathered`` is read too.
+    A folder of ``image_gathered`` with its twin in ``groundtruth_depth_gathered`` is read too: the
+    first 110 frames, which published evaluations copy.
     10 frames a second by the number in the name; there are no poses.
 
     Args:
@@ -58,7 +59,7 @@ class KittiDepth(ListedSequence):
             )
         shots = [Shot(number / RATE_HZ, images[number], path) for number, path in depth.items()]
         super().__init__(
-            f"kitti-depth-{folder.name.removesuffix('_sync')}",
+            f"kitti-depth-{folder.name.split('_sync')[0]}",
             shots,
             _lens(images_folder),
             partial(read_depth, units_per_m=DEPTH_UNITS_PER_M, advice=AGAIN),
