@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from laser_slam.backbones.classical.compiled import finite_kernel
+
 MIN_DEPTH = 1e-6
 BEHIND_COST = 1e6  # of an observation behind its camera: no solution
 TRIALS = 6  # of larger and larger damping in one iteration
@@ -144,7 +146,7 @@ def normal_equations(
                     W[o, i, j] = J_cam[0, i] * J_point[0, j] + J_cam[1, i] * J_point[1, j]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@finite_kernel
 def eliminate_points(cameras, starts, W, V, b, damping, S, s, V_inv):
     """Subtract the points' part: S -= W V^-1 W^T, s -= W V^-1 b (lower blocks only)."""
     Y = np.zeros((6, 3))
@@ -171,7 +173,7 @@ def eliminate_points(cameras, starts, W, V, b, damping, S, s, V_inv):
                         )
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@finite_kernel
 def _solve_cholesky(S, s):
     """Solve S x = s in place from the lower triangle; False when S is not positive."""
     n = S.shape[0]

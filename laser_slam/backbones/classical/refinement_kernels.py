@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from laser_slam.backbones.classical.compiled import finite_kernel
+
 MIN_CORRELATION = 0.75
 MAX_SHIFT_PX = 4.0
 MIN_SLANT = 0.08  # cosine between a plane's normal and the ray: below, the patch is edge-on
@@ -12,7 +14,7 @@ ITERATIONS = 8
 SETTLED_PX = 0.01
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@finite_kernel
 def _sample(image, x, y):
     """Return the bilinear value and its derivatives by x and y; the caller checks the bounds."""
     i, j = int(y), int(x)
@@ -22,7 +24,7 @@ def _sample(image, x, y):
     return top + fy * (bottom - top), (1 - fy) * (b - a) + fy * (d - c), bottom - top
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@finite_kernel
 def _template(image, x, y, radius, out):
     """Fill the zero-mean patch around (x, y); return its norm, or 0 outside the image."""
     height, width = image.shape
@@ -41,7 +43,7 @@ def _template(image, x, y, radius, out):
     return np.sqrt(squares)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@finite_kernel
 def _warp(x, y, radius, R, t, plane, intrinsics, out):
     """Fill (K, 2) positions in the other view of the patch around (x, y); False behind it.
 
@@ -66,7 +68,7 @@ def _warp(x, y, radius, R, t, plane, intrinsics, out):
     return True
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@finite_kernel
 def _align(image, template, norm, places, start, values, gradients):
     """Shift the warped patch until it matches; return shift x, y and the correlation (-1: lost)."""
     height, width = image.shape

@@ -6,6 +6,8 @@ import numpy as np
 from numba import njit, types
 from numba.extending import intrinsic
 
+from laser_slam.backbones.classical.compiled import finite_kernel
+
 STEP_PENALTY = np.float32(3.0)  # Hamming bits for a step of one plane
 JUMP_PENALTY, JUMP_FLOOR = (
     np.float32(60.0),
@@ -41,7 +43,7 @@ def _count_bits(_, value):
     return types.uint32(types.uint32), generate
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@finite_kernel
 def _side_costs(census, i, j, others, maps, planes, sums, counts):
     """Add to (D,) sums and counts the Hamming distances of one pixel in the views of one side."""
     height, width = others.shape[1], others.shape[2]
@@ -91,7 +93,7 @@ def fill_volume(census, past, future, past_maps, future_maps, planes, volume):
                 volume[i, j, d] = np.uint8(np.float32(4.0) * cost)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@finite_kernel
 def _path_step(volume, previous, jump, current, total):
     """Extend one path by a pixel: (D,) costs so far to (D,) costs with this pixel."""
     num = previous.shape[0]
@@ -106,7 +108,7 @@ def _path_step(volume, previous, jump, current, total):
         total[d] += current[d]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@finite_kernel
 def _jump(grey, i, j, k, m):
     contrast = np.float32(abs(np.int64(grey[i, j]) - np.int64(grey[k, m])))
     return max(JUMP_FLOOR, JUMP_PENALTY / (np.float32(1.0) + EDGE_WEIGHT * contrast))
