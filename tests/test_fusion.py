@@ -154,6 +154,22 @@ def test_the_unit_of_the_world_scales_the_cloud() -> None:
     np.testing.assert_allclose(other.points, 4 * cloud.points, atol=1e-6)
 
 
+@pytest.mark.parametrize("stride", [1, 2, 4])
+def test_a_wall_stays_in_the_map_whatever_pixels_are_used(stride: int) -> None:
+    wall = np.full((12, *SIZE), 5.0, np.float32)
+    submap = submap_of(wall)
+    aside = np.tile(np.eye(4), (12, 1, 1))
+    aside[:, 0, 3] = np.random.default_rng(1).normal(size=12)
+    prediction = replace(
+        submap.prediction, window_from_cam=aside, confidence=np.ones_like(wall, np.float32)
+    )
+    config = FusionConfig(stride=stride, min_observations=10)
+    cloud = fuse([replace(submap, prediction=prediction)], config)
+    width_m = 5.0 * SIZE[1] / submap.prediction.intrinsics[0, 0, 0] * submap.world_from_window.scale
+    spread = np.ptp(cloud.points, axis=0).max()
+    assert spread > 0.8 * width_m
+
+
 def test_both_sides_of_a_depth_edge_stay_out() -> None:
     depth = np.full(SIZE, 5.0, np.float32)
     depth[:, 20:] = 2.0

@@ -30,7 +30,10 @@ class FusionConfig(Section):
         0.0, ge=0, description="edge of the averaging voxels in world units; 0: auto_voxel decides"
     )
     auto_voxel: float = Field(
-        0.006, gt=0, description="edge of the voxels, in median depths of the first good window"
+        0.006,
+        gt=0,
+        description="edge of the voxels, in median depths of the first good window; no less than "
+        "the gap between used pixels there",
     )
     min_observations: int = Field(
         20, ge=1, description="views that a voxel and its 26 neighbours need in sum; fewer: noise"

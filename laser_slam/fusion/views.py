@@ -44,11 +44,16 @@ def _median_depth(submap: Submap, config: FusionConfig) -> float | None:
 
 
 def automatic_voxel_size(submap: Submap, config: FusionConfig) -> float | None:
-    """Return the edge of the voxels in world units that suits a submap; None: it has no depth."""
+    """Return the edge of the voxels in world units that suits a submap; None: it has no depth.
+
+    It is no shorter than the gap between used pixels at the median depth: else the views that a
+    voxel needs would seldom meet in it, and little of the map would stay.
+    """
     median = _median_depth(submap, config)
     if median is None:
         return None
-    return config.auto_voxel * median * submap.world_from_window.scale
+    gap = config.stride / float(np.median(submap.prediction.intrinsics[:, 0, 0]))
+    return max(config.auto_voxel, gap) * median * submap.world_from_window.scale
 
 
 def owned_views(submap: Submap, config: FusionConfig) -> Iterator[View]:
