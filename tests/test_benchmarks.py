@@ -287,7 +287,7 @@ def test_without_data_the_reason_says_how_to_pass_it(tmp_path: Path) -> None:
     assert found.reason is not None
     assert "pass --data, or set LASER_SLAM_DATA" in found.reason
     work = Bench(load_table("kitti"), Material(tmp_path / "nowhere"), tmp_path, only=("03",))
-    assert "not there, in kitti_odometry or dataset or sequences of the data" in str(
+    assert "not there, in kitti_odometry or KITTI_Odometry or dataset or sequences of" in str(
         work.run([Setting("ours")])[0].reason
     )
 

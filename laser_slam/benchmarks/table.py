@@ -142,6 +142,8 @@ class Table(_Part):
         rows: what is compared, by name: the settings in which it differs.
         sequences: inputs by name.
         groups: names of sequences by the name of their group.
+        borrowed: groups of shipped tables, by the table's name, that this one has with all their
+            sequences, which stand before its own.
         blocks: of columns.
     """
 
@@ -151,7 +153,28 @@ class Table(_Part):
     rows: dict[str, tuple[str, ...]] = Field(default={"ours": ()}, min_length=1)
     sequences: dict[str, SequenceSpec]
     groups: dict[str, tuple[str, ...]] = {}
+    borrowed: dict[str, tuple[str, ...]] = {}
     blocks: tuple[Block, ...]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _borrow(cls, raw: Any) -> Any:
+        if not isinstance(raw, dict) or not raw.get("borrowed"):
+            return raw
+        sequences, groups = {}, {}
+        for name, wanted in raw["borrowed"].items():
+            other = load_table(name)
+            for group in wanted:
+                if group not in other.groups:
+                    raise ValueError(f"the table {name} has no group {group}")
+                groups[group] = other.groups[group]
+                sequences.update({each: other.sequences[each] for each in groups[group]})
+        own = {key: raw.get(key) or {} for key in ("sequences", "groups")}
+        return {
+            **raw,
+            "sequences": {**sequences, **own["sequences"]},
+            "groups": {**groups, **own["groups"]},
+        }
 
     @model_validator(mode="after")
     def _columns_have_sequences(self) -> Self:
