@@ -10,7 +10,7 @@ from typing import Any
 Scores = Mapping[str, Any]
 
 PROTOCOL_VERSION = 2  # rises when a protocol's numbers change, so that kept ones are not taken
-POINTS = ("indoor", "7scenes", "nrgbd", "outdoor")  # protocols of point maps
+POINTS = ("indoor", "7scenes", "nrgbd", "outdoor", "waymo")  # protocols of point maps
 
 
 @dataclass(frozen=True)

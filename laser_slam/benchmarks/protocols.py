@@ -11,6 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from laser_slam.benchmarks.truth import (
+    TruePoints,
+    exact_points,
+    room_points,
+    seven_scenes_points,
+    street_points,
+)
 from laser_slam.camera import resize_intrinsics, unproject
 from laser_slam.datasets.base import Dataset
 from laser_slam.evaluation import (
@@ -32,14 +39,9 @@ from laser_slam.sim3 import Sim3
 
 Depth = NDArray[np.float32]
 Array = NDArray[np.float64]
-Size = tuple[int, int]
 Protocol = Callable[[Path, Dataset], dict[str, Any]]
-Camera = Callable[[Array, Size, Size], Array]
-"""Intrinsics, size of the images and size of the map -> intrinsics of the map."""
 
 CALIBRATION = "calibration.yaml"
-PUBLISHED_SIZE = (392, 518)  # (height, width) of the truth that published maps of rooms meet
-FOCAL_READ_AS = 554.2562584220408 / 525  # 7-Scenes: the evaluation's focal length and the depth's
 
 
 def _views(folder: Path) -> Iterator[DepthView]:
@@ -54,18 +56,12 @@ class _Truth:
         folder: of the run.
         dataset: that it was run on.
         keep: chooses what of a map is compared, before anything is done to it.
-        bend: changes true intrinsics for a size as an evaluation does; None: it takes them as
-            they are.
     """
 
     def __init__(
-        self,
-        folder: Path,
-        dataset: Dataset,
-        keep: Callable[[Depth], Depth] = np.asarray,
-        bend: Camera | None = None,
+        self, folder: Path, dataset: Dataset, keep: Callable[[Depth], Depth] = np.asarray
     ) -> None:
-        self._dataset, self._keep, self._bend, self._rectifier = dataset, keep, bend, None
+        self._dataset, self._keep, self._rectifier = dataset, keep, None
         path = folder / CALIBRATION
         if path.exists():
             calibration = load_calibration(path)
@@ -80,13 +76,13 @@ class _Truth:
         kept = self._keep(truth)
         return kept if self._rectifier is None else self._rectifier.depth(kept)
 
-    def intrinsics(self, size: Size, seen: Array) -> Array:
-        """Return the (3, 3) true ones for maps of (height, width), or ``seen`` if rectified."""
+    def intrinsics(self, depth: Depth, view: DepthView) -> Array:
+        """Return the (3, 3) of a frame's true depth: the true ones, or those it is rectified to."""
         info = self._dataset.info
+        size = depth.shape[0], depth.shape[1]
         if self._rectifier is not None or info.intrinsics is None:
-            return seen
-        if self._bend is not None:
-            return self._bend(info.intrinsics, info.size, size)
+            seen = view.depth.shape[0], view.depth.shape[1]
+            return resize_intrinsics(view.intrinsics, seen, size)
         return resize_intrinsics(info.intrinsics, info.size, size)
 
 
@@ -105,7 +101,7 @@ def _video_depth(protocol: VideoDepthProtocol) -> Protocol:
     return score
 
 
-def _points(protocol: PointProtocol, bend: Camera | None = None) -> Protocol:
+def _points(protocol: PointProtocol, true_points: TruePoints = exact_points) -> Protocol:
     def score(folder: Path, dataset: Dataset) -> dict[str, Any]:
         if dataset.info.truth is None:
             return {"reason": "no true poses"}
@@ -113,13 +109,16 @@ def _points(protocol: PointProtocol, bend: Camera | None = None) -> Protocol:
             return {"reason": "the intrinsics of the true depth are unknown"}
         if next(_views(folder), None) is None:
             return {"reason": "the run has no depth map"}
-        known = _Truth(folder, dataset, partial(comparable_depth, protocol=protocol), bend)
-        return asdict(evaluate_points(_point_maps(folder, dataset, known), protocol))
+        known = _Truth(folder, dataset, partial(comparable_depth, protocol=protocol))
+        maps = _point_maps(folder, dataset, known, true_points)
+        return asdict(evaluate_points(maps, protocol))
 
     return score
 
 
-def _point_maps(folder: Path, dataset: Dataset, known: _Truth) -> Iterator[PointMap]:
+def _point_maps(
+    folder: Path, dataset: Dataset, known: _Truth, true_points: TruePoints
+) -> Iterator[PointMap]:
     """Give the points of every frame whose true depth and pose are known; NaN: not predicted."""
     poses = _true_poses(dataset)
     like = next(_views(folder))  # frames that the run has no view of are given in its size
@@ -128,12 +127,12 @@ def _point_maps(folder: Path, dataset: Dataset, known: _Truth) -> Iterator[Point
         depth = known.depth(frame) if frame in poses else None
         if depth is None:
             continue
-        K = known.intrinsics(size, (view or like).intrinsics)
-        truth = _unproject(_resized(depth, size), K, poses[frame])
+        in_cam = true_points(depth, known.intrinsics(depth, view or like), size)
+        truth = _placed(in_cam, poses[frame])
         if view is None:
             yield PointMap(np.full_like(truth, np.nan), truth, np.zeros(size, np.float32))
         else:
-            found = _unproject(view.depth, view.intrinsics, view.world_from_cam)
+            found = _placed(unproject(view.depth, view.intrinsics), view.world_from_cam)
             yield PointMap(found, truth, view.confidence)
 
 
@@ -155,49 +154,18 @@ def _true_poses(dataset: Dataset) -> dict[int, Array]:
     return dict(zip(truth.frames.tolist(), truth.world_from_cam, strict=True))
 
 
-def published_camera(intrinsics: Array, size: Size, new_size: Size, focal_as: float) -> Array:
-    """Return the camera with which pi3's and LASER's evaluations unproject the truth of rooms.
-
-    It belongs to maps of ``PUBLISHED_SIZE``. Both axes are scaled with the larger of the two
-    factors, and the focal length of 7-Scenes is that of NRGBD: the truth is bent, and a perfect
-    map has errors. Whoever is compared with their numbers must meet the same truth.
-
-    Args:
-        intrinsics: (3, 3) of the true depth.
-        size: (height, width) of it.
-        new_size: (height, width) of the map.
-        focal_as: what the focal length is multiplied with.
-    """
-    factor = max(new / old for new, old in zip(PUBLISHED_SIZE, size, strict=True))
-    bent = np.array(intrinsics, np.float64)
-    bent[[0, 1], [0, 1]] *= factor * focal_as
-    bent[:2, 2] = (bent[:2, 2] + 0.5) * factor - 0.5
-    return resize_intrinsics(bent, PUBLISHED_SIZE, new_size)
-
-
-def _resized(depth: Depth, size: Size) -> Depth:
-    """Take the nearest pixels: means over depth edges would be no truth."""
-    rows, columns = (_nearest(new, old) for new, old in zip(size, depth.shape, strict=True))
-    return depth[np.ix_(rows, columns)]
-
-
-def _nearest(num: int, of: int) -> NDArray[np.int64]:
-    return np.clip(((np.arange(num) + 0.5) * of / num).astype(np.int64), 0, of - 1)
-
-
-def _unproject(depth: Depth, K: Array, world_from_cam: Array) -> Array:
+def _placed(in_cam: Array, world_from_cam: Array) -> Array:
     """Return (H, W, 3) world points; NaN: unknown."""
-    in_cam = unproject(depth, K)
-    return np.asarray(Sim3.from_matrix(world_from_cam).apply(in_cam.reshape(-1, 3))).reshape(
-        *depth.shape, 3
-    )
+    moved = Sim3.from_matrix(world_from_cam).apply(in_cam.reshape(-1, 3))
+    return np.asarray(moved).reshape(in_cam.shape)
 
 
 PROTOCOLS: dict[str, Protocol] = {
     **{f"video_depth_{name}": _video_depth(each) for name, each in VIDEO_DEPTH_PROTOCOLS.items()},
     "points_indoor": _points(INDOOR_POINTS),
-    "points_7scenes": _points(INDOOR_POINTS, partial(published_camera, focal_as=FOCAL_READ_AS)),
-    "points_nrgbd": _points(INDOOR_POINTS, partial(published_camera, focal_as=1.0)),
     "points_outdoor": _points(OUTDOOR_POINTS),
+    "points_7scenes": _points(INDOOR_POINTS, seven_scenes_points),
+    "points_nrgbd": _points(INDOOR_POINTS, room_points),
+    "points_waymo": _points(OUTDOOR_POINTS, street_points),
 }
 """Name -> scores of a finished run; their ``reason`` says why there are none."""
