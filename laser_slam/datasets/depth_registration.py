@@ -1,0 +1,41 @@
+"""Depth as another camera beside the depth camera sees it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from laser_slam.camera import rays
+
+Array = NDArray[np.float64]
+Depth = NDArray[np.float32]
+
+
+def register_depth(
+    depth: Depth, depth_intrinsics: Array, intrinsics: Array, cam_from_depth_cam: Array
+) -> Depth:
+    """Carry each pixel's point to its nearest pixel of the other camera; the nearest one hides.
+
+    Pixels that nothing falls on stay unknown, such as those beside an edge in front.
+
+    Args:
+        depth: (H, W) z in metres; NaN: unknown.
+        depth_intrinsics: (3, 3) of the camera that measured it.
+        intrinsics: (3, 3) of the other camera, whose images have the same size.
+        cam_from_depth_cam: (4, 4) rigid, metres.
+
+    Returns:
+        (H, W) z in metres of the other camera; NaN: unknown.
+    """
+    known = np.isfinite(depth)
+    points = rays(depth_intrinsics, *depth.shape)[known] * depth[known].astype(np.float64)[:, None]
+    points = points @ cam_from_depth_cam[:3, :3].T + cam_from_depth_cam[:3, 3]
+    points = points[points[:, 2] > 0]
+    pixels = points @ intrinsics.T
+    columns, rows = np.rint(pixels[:, :2] / pixels[:, 2:]).astype(np.int64).T
+    height, width = depth.shape
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    nearest = np.full(depth.shape, np.inf, np.float32)
+    where = rows[inside], columns[inside]
+    np.minimum.at(nearest, where, points[inside, 2].astype(np.float32))
+    return np.where(np.isfinite(nearest), nearest, np.float32(np.nan))
