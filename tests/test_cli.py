@@ -290,6 +290,15 @@ def test_wrong_usage_exits_with_2(arguments: list[str]) -> None:
     assert run(*arguments).exit_code == 2
 
 
+def test_config_says_what_each_setting_means_and_may_be() -> None:
+    lines = run("config").stdout.splitlines()
+    [stride] = [line for line in lines if line.startswith("  stride: 1  # every so many-th row")]
+    assert stride.endswith("[>= 1]")
+    assert any("[anchors | points | joint]" in line for line in lines)
+    bare = [line for line in lines if "  # " not in line]
+    assert not bare, f"settings without a description: {bare}"
+
+
 def test_config_prints_settings_that_load_again(tmp_path: Path) -> None:
     result = run("config", "--set", "windows.size=31")
     (tmp_path / "all.yaml").write_text(result.stdout)

@@ -26,7 +26,7 @@ def eval(
 
 @command
 def config(config: ConfigOption = None, set: SetOption = None) -> None:
-    """Print all settings, resolved."""
-    from laser_slam.config import dump_config
+    """Print all settings, resolved, with what they mean: YAML that --config takes."""
+    from laser_slam.config import explain_config
 
-    typer.echo(dump_config(resolve(config, set or [])), nl=False)
+    typer.echo(explain_config(resolve(config, set or [])), nl=False)

@@ -2,6 +2,7 @@
 
 from laser_slam.config.backbones import BackboneConfig, ClassicalConfig, ReplayConfig
 from laser_slam.config.closures import ClosuresConfig
+from laser_slam.config.explaining import explain_config
 from laser_slam.config.fusion import FusionConfig
 from laser_slam.config.layers import LayersConfig, SegmentationConfig
 from laser_slam.config.loading import (
@@ -51,6 +52,7 @@ __all__ = [
     "WindowsConfig",
     "assigned",
     "dump_config",
+    "explain_config",
     "load_config",
     "setting_names",
     "shipped_configs",
