@@ -37,11 +37,13 @@ def claimed(folder: Path) -> Iterator[None]:
         raise RunFolderError(f"cannot use {folder}: {error.strerror}") from error
     try:
         _lock(handle, folder)
-        yield
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # it is not empty
+                folder.rmdir()
     finally:
         os.close(handle)
-        with suppress(OSError):  # it is not empty
-            folder.rmdir()
 
 
 def _lock(handle: int, folder: Path) -> None:
@@ -53,3 +55,6 @@ def _lock(handle: int, folder: Path) -> None:
         raise TakenError(f"another process is at work in {folder}") from error
     except OSError:  # a file system without locks
         return
+    # Who had it may have removed it as empty since it was opened here.
+    if not folder.exists() or not os.path.samestat(os.fstat(handle), folder.stat()):
+        raise TakenError(f"another process was at work in {folder}")
