@@ -178,6 +178,16 @@ def test_the_images_that_monst3r_takes_of_kitti_depth_are_read_from_either_side(
         assert dataset.info.name == LAYOUTS["kitti-depth"].name
 
 
+def test_a_whole_sequence_may_be_called_as_chosen_frames_are(tmp_path: Path) -> None:
+    for key, name in {
+        "tum-rgbd": "rgb_freiburg3",
+        "bonn": "rgb_desk",
+        "scannet": "color_2",
+    }.items():
+        folder = write_layout(key, tmp_path, NUM).rename(tmp_path / name)
+        assert LAYOUTS[key].open(folder).info.num_frames == NUM
+
+
 def official_association(first: list[float], second: list[float]) -> dict[int, int]:
     """Do what TUM's ``associate.py`` says it does, slowly: the best of all pairs that are left."""
     left = {(i, j) for i in range(len(first)) for j in range(len(second))}

@@ -114,8 +114,14 @@ KITTI_FAULTS = {
         edit(f"{SEQUENCE}/times.txt", lambda t: t.replace("3.0", "x")),
         "line 4 of .*times.txt must hold 1 number;",
     ),
-    "no times": (remove(f"{SEQUENCE}/times.txt"), "cannot read .*times.txt"),
-    "no calibration": (remove(f"{SEQUENCE}/calib.txt"), "cannot read .*calib.txt"),
+    "no times": (
+        remove(f"{SEQUENCE}/times.txt"),
+        "cannot read .*times.txt .*; unpack KITTI's data_odometry_calib.zip",
+    ),
+    "no calibration": (
+        remove(f"{SEQUENCE}/calib.txt"),
+        "cannot read .*calib.txt .*; unpack KITTI's data_odometry_calib.zip",
+    ),
     "no row of the camera": (
         edit(f"{SEQUENCE}/calib.txt", lambda t: t.splitlines()[0]),
         "has no row P2, which belongs to image_2",

@@ -60,7 +60,7 @@ class ScanNet(ListedSequence):
     def __init__(self, folder: Path) -> None:
         named = folder.resolve()
         scene = named
-        if named.name.startswith(PREPARED):
+        if named.name.startswith(PREPARED) and not (named / "color").is_dir():
             scene, shots = named.parent, _prepared(named)
         elif _cpp_files(folder, "color", IMAGES):
             shots = _exported_by_cpp(folder)

@@ -59,7 +59,8 @@ def read_shots(folder: Path) -> list[Shot]:
 def sequence_folder(folder: Path) -> Path:
     """Return the folder of the whole sequence that a folder of chosen images lies in."""
     named = folder.resolve()
-    return named.parent if named.name.startswith(PREPARED) else folder
+    is_prepared = named.name.startswith(PREPARED) and not (named / "rgb.txt").is_file()
+    return named.parent if is_prepared else folder
 
 
 def _list_prepared(folder: Path) -> list[tuple[float, Path]]:
