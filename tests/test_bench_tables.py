@@ -21,7 +21,7 @@ from laser_slam.benchmarks import (
     table_names,
 )
 from laser_slam.benchmarks.notes import write_notes
-from laser_slam.benchmarks.page import Report
+from laser_slam.benchmarks.page import Report, put_on_page
 from laser_slam.benchmarks.table import FOLDER, Table, parse_table
 from laser_slam.errors import ConfigError
 
@@ -259,6 +259,22 @@ def test_a_section_tells_only_of_what_was_run() -> None:
     assert "- b: x" not in text
     assert "- **ours**: as all rows are" in text
     assert "\n\n\n" not in text
+
+
+def test_a_page_gets_the_words_of_today_and_keeps_the_tables_of_others(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    put_on_page(page, "a", "## A\n\n1")
+    head, _, _ = page.read_text().partition("\n<!-- bench a -->")
+    page.write_text(page.read_text().replace("no number by hand", "and so on"))
+    put_on_page(page, "b", "## B\n\n2")
+    text = page.read_text()
+    assert text.startswith(head)
+    assert "and so on" not in text
+    assert text.count("<!-- bench a -->\n## A\n\n1\n<!-- end of bench a -->") == 1
+    assert "## B" in text
+    page.write_text("# My own words\n")
+    put_on_page(page, "b", "## B\n\n2")
+    assert page.read_text().startswith("# My own words\n\n<!-- bench b -->\n## B")
 
 
 @pytest.mark.parametrize(

@@ -119,6 +119,8 @@ def save_table(out: Path, report: Report, page: Path | None = None) -> list[Path
 def put_on_page(page: Path, name: str, section: str) -> None:
     """Write a table's section, in the place of the one that the page has of it.
 
+    What stands before the first table is renewed where this program wrote it.
+
     Args:
         page: Markdown file; made where there is none.
         name: of the table.
@@ -132,6 +134,9 @@ def put_on_page(page: Path, name: str, section: str) -> None:
         text = page.read_text(encoding="utf-8") if page.exists() else HEAD
     except (OSError, UnicodeDecodeError) as error:
         raise RunFolderError(f"cannot read {page}: {error}") from error
+    if text.startswith(HEAD[: HEAD.index(",")]):
+        _, mark, tables = text.partition("\n<!-- bench ")
+        text = HEAD + mark + tables
     whole = f"{start}\n{section.strip()}\n{end}"
     found = re.search(f"{re.escape(start)}.*?{re.escape(end)}", text, re.DOTALL)
     if found is None:
