@@ -167,6 +167,15 @@ def scannet(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
         write_png(folder / "depth" / f"{frame}.png", counts(frame, 1000, scene)[1::2, 1::2])
         write_matrix(folder / "pose" / f"{frame}.txt", scene.pose(frame))
     write_matrix(folder / "intrinsic" / "intrinsic_color.txt", _four(scene.intrinsics))
+    write_matrix(folder / "intrinsic" / "intrinsic_depth.txt", _four(_of_half(scene)))
+
+
+def _of_half(scene: Scene) -> Array:
+    """Return the intrinsics of a camera that has every second pixel, from the second on."""
+    halved = scene.intrinsics.copy()
+    halved[:2] /= 2
+    halved[:2, 2] -= 0.5
+    return halved
 
 
 def scannet_by_cpp(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
@@ -179,12 +188,11 @@ def scannet_by_cpp(folder: Path, num: int, scene: Scene = CORRIDOR) -> None:
         head += f"{stored.shape[0]}\n65535\n"
         write_bytes(stem.with_suffix(".depth.pgm"), head.encode() + stored.astype(">u2").tobytes())
         write_matrix(stem.with_suffix(".pose.txt"), scene.pose(frame))
-    numbers = " ".join(f"{number:.9g}" for number in _four(scene.intrinsics).ravel())
-    write_text(
-        folder / "_info.txt",
-        f"m_versionNumber = 4\nm_depthShift = 1000\nm_calibrationColorIntrinsic = {numbers} \n"
-        "m_frames.size = 9\n",
-    )
+    lines = ["m_versionNumber = 4", "m_depthShift = 1000"]
+    for camera, intrinsics in {"Color": scene.intrinsics, "Depth": _of_half(scene)}.items():
+        numbers = " ".join(f"{number:.9g}" for number in _four(intrinsics).ravel())
+        lines += [f"m_calibration{camera}Intrinsic = {numbers} "]
+    write_text(folder / "_info.txt", "\n".join([*lines, "m_frames.size = 9", ""]))
 
 
 def _four(intrinsics: Array) -> Array:

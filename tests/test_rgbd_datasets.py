@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from corridor import SIZE, TrueBackbone, true_intrinsics, true_pose, view
+from image_files import write_png
 from layouts import FIRST_DEPTH, LAYOUTS, counts, open_layout, scanned, write_exr, write_layout
 from typer.testing import CliRunner
 
 import laser_slam.pipeline
+from laser_slam.camera import rays, resize_intrinsics
 from laser_slam.cli import app
 from laser_slam.config import load_config
 from laser_slam.datasets import DATASETS
@@ -218,6 +220,33 @@ def test_the_numbers_of_scannet_order_it_and_time_it(tmp_path: Path) -> None:
     depth = dataset.true_depth(1)
     assert depth is not None
     np.testing.assert_allclose(depth[1::2, 1::2], counts(9, 1000)[1::2, 1::2] / 1000, rtol=1e-6)
+
+
+def test_depth_of_scannet_is_looked_up_where_its_own_camera_saw_it(tmp_path: Path) -> None:
+    """Its camera may be wider than the images, which a change of size would not know."""
+    folder = write_layout("scannet", tmp_path, 1)
+    wider = np.eye(4)
+    wider[:3, :3] = resize_intrinsics(true_intrinsics(), SIZE, (36, 64))
+    wider[:2, :2] *= 0.8
+    np.savetxt(folder / "intrinsic" / "intrinsic_depth.txt", wider)
+    directions = rays(wider[:3, :3], 36, 64)
+    stored = np.rint(1000 * (3 + directions[..., 0] + 0.5 * directions[..., 1])).astype(np.uint16)
+    write_png(folder / "depth" / "0.png", stored)
+    depth = ScanNet(folder).true_depth(0)
+    assert depth is not None
+    seen = rays(true_intrinsics(), *SIZE)
+    half_a_pixel = 0.5 / wider[0, 0] + 0.25 / wider[1, 1] + 1e-3
+    np.testing.assert_allclose(depth, 3 + seen[..., 0] + 0.5 * seen[..., 1], atol=half_a_pixel)
+    wider[:2, :2] *= 2  # now it is narrower
+    np.savetxt(folder / "intrinsic" / "intrinsic_depth.txt", wider)
+    depth = ScanNet(folder).true_depth(0)
+    assert depth is not None
+    assert np.isnan(depth[:, 0]).all()
+    assert np.isfinite(depth[20:50, 40:90]).all()
+    (folder / "intrinsic" / "intrinsic_depth.txt").unlink()
+    taken = ScanNet(folder).true_depth(0)
+    assert taken is not None
+    np.testing.assert_allclose(taken[1::2, 1::2], stored / 1000, rtol=1e-6)
 
 
 def test_rows_of_nan_are_no_poses_in_nrgbd(tmp_path: Path) -> None:

@@ -32,10 +32,38 @@ def register_depth(
     points = points @ cam_from_depth_cam[:3, :3].T + cam_from_depth_cam[:3, 3]
     points = points[points[:, 2] > 0]
     pixels = points @ intrinsics.T
-    columns, rows = np.rint(pixels[:, :2] / pixels[:, 2:]).astype(np.int64).T
+    columns, rows = _nearest(pixels[:, :2] / pixels[:, 2:]).T
     height, width = depth.shape
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     nearest = np.full(depth.shape, np.inf, np.float32)
     where = rows[inside], columns[inside]
     np.minimum.at(nearest, where, points[inside, 2].astype(np.float32))
     return np.where(np.isfinite(nearest), nearest, np.float32(np.nan))
+
+
+def look_up_depth(
+    depth: Depth, depth_intrinsics: Array, intrinsics: Array, size: tuple[int, int]
+) -> Depth:
+    """Give each pixel of another camera at the same place the nearest depth in its direction.
+
+    Args:
+        depth: (H, W) z in metres; NaN: unknown.
+        depth_intrinsics: (3, 3) of the camera that measured it.
+        intrinsics: (3, 3) of the other camera.
+        size: (height, width) of the other camera's images.
+
+    Returns:
+        (height, width) z in metres; NaN: unknown, or beyond the edge of ``depth``.
+    """
+    seen = rays(intrinsics, *size)
+    columns = _nearest(seen[0, :, 0] * depth_intrinsics[0, 0] + depth_intrinsics[0, 2])
+    rows = _nearest(seen[:, 0, 1] * depth_intrinsics[1, 1] + depth_intrinsics[1, 2])
+    framed = np.pad(depth, 1, constant_values=np.nan)
+    height, width = framed.shape
+    return np.asarray(
+        framed[np.ix_((rows + 1).clip(0, height - 1), (columns + 1).clip(0, width - 1))]
+    )
+
+
+def _nearest(places: Array) -> NDArray[np.int64]:
+    return np.asarray(np.rint(places), np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from laser_slam.datasets.decoding import read_depth, read_header
+from laser_slam.datasets.depth_registration import look_up_depth
 from laser_slam.datasets.lens import Depth, Lens
 from laser_slam.datasets.listed import ListedSequence, Shot, numbered_files, require
 from laser_slam.datasets.poses import (
@@ -27,7 +29,7 @@ PREPARED_STEP = 3  # of the frames that published evaluations copy
 UNITS_PER_M = 1000.0
 IMAGES = (".jpg", ".jpeg", ".png")
 PREPARED = "color_"  # begins the folder of those frames
-INFO_ROW = "m_calibrationColorIntrinsic"
+INFO_ROW = "m_calibration{}Intrinsic"
 AGAIN = "export the scene's .sens file again"
 EXPORT = (
     "export it with ScanNet's SensReader/python/reader.py: --export_color_images "
@@ -43,10 +45,11 @@ class ScanNet(ListedSequence):
     of chosen frames that published evaluations copy: ``color_90/frame_0000.jpg`` with ``depth_90``
     and ``pose_90.txt`` beside it, every third frame of the scene.
 
-    Depth is 16 bits, in millimetres, 0: unknown, and smaller than the colour images (640x480 for
-    1296x968): it is brought to their size by its nearest pixels, and taken as registered with
-    them. A frame whose pose is missing or not finite has no true pose. There are no times: 30
-    frames a second by the number in the name.
+    Depth is 16 bits, in millimetres, 0: unknown, of a camera of its own (640x480 for 1296x968) at
+    the same place: each pixel of the colour image gets the nearest depth in its direction, by the
+    intrinsics of both. Without those of depth it is taken as registered with the images. A frame
+    whose pose is missing or not finite has no true pose. There are no times: 30 frames a second by
+    the number in the name.
 
     Args:
         folder: of one scene, such as ``scene0707_00``; or its ``color_90``.
@@ -66,7 +69,9 @@ class ScanNet(ListedSequence):
             shots = _exported_by_cpp(folder)
         else:
             shots = _exported(folder)
-        super().__init__(f"scannet-{scene.name}", shots, _lens(scene), _read_scaled_depth)
+        lens = _lens(scene)
+        read = partial(_read_scaled_depth, depth_K=_read_intrinsics(scene, "depth"), color=lens)
+        super().__init__(f"scannet-{scene.name}", shots, lens, read)
 
 
 def _exported(folder: Path) -> list[Shot]:
@@ -138,22 +143,36 @@ def _prepared(folder: Path) -> list[Shot]:
 
 
 def _lens(folder: Path) -> Lens:
-    path, info = folder / "intrinsic" / "intrinsic_color.txt", folder / "_info.txt"
-    if path.is_file():
-        return Lens(read_matrix(path, 4, AGAIN)[:3, :3], f"{path.parent.name}/{path.name}")
-    if not info.is_file():
+    intrinsics = _read_intrinsics(folder, "color")
+    if intrinsics is None:
         return Lens(None, "unknown: no intrinsic/intrinsic_color.txt")
+    is_by_cpp = (folder / "_info.txt").is_file()
+    return Lens(intrinsics, "_info.txt" if is_by_cpp else "intrinsic/intrinsic_color.txt")
+
+
+def _read_intrinsics(folder: Path, camera: str) -> Array | None:
+    """Read those of ``color`` or ``depth``; None: neither reader has left them."""
+    path, info = folder / "intrinsic" / f"intrinsic_{camera}.txt", folder / "_info.txt"
+    if path.is_file():
+        return read_matrix(path, 4, AGAIN)[:3, :3]
+    if not info.is_file():
+        return None
+    row = INFO_ROW.format(camera.capitalize())
     for number, words in read_rows(info, AGAIN):
-        if words[0] == INFO_ROW:
-            return Lens(matrix_of_words(info, number, words[2:], AGAIN)[:3, :3], info.name)
-    raise DatasetError(f"{info} has no row {INFO_ROW}; {AGAIN}")
+        if words[0] == row:
+            return matrix_of_words(info, number, words[2:], AGAIN)[:3, :3]
+    raise DatasetError(f"{info} has no row {row}; {AGAIN}")
 
 
-def _read_scaled_depth(path: Path, size: tuple[int, int]) -> Depth:
+def _read_scaled_depth(
+    path: Path, size: tuple[int, int], depth_K: Array | None, color: Lens
+) -> Depth:
     header = read_header(path)
     if header is None:
         raise DatasetError(f"{path} is no image; {AGAIN}")
-    depth = read_depth(path, header.size, UNITS_PER_M, AGAIN)
+    depth, color_K = read_depth(path, header.size, UNITS_PER_M, AGAIN), color.at(size)
+    if depth_K is not None and color_K is not None:
+        return look_up_depth(depth, depth_K, color_K, size)
     if header.size == size:
         return depth
     # INTER_NEAREST would take each block's corner, half a block off
