@@ -199,6 +199,10 @@ def test_a_claim_is_for_one_and_leaves_nothing(tmp_path: Path) -> None:
             pass
         assert folder.is_dir()
     assert not folder.exists()
+    with claimed(folder, to_read=True), claimed(folder, to_read=True):
+        with pytest.raises(TakenError), claimed(folder):
+            pass
+        assert folder.is_dir()
     with claimed(folder):
         (folder / "kept").touch()
     assert (folder / "kept").exists()

@@ -20,11 +20,12 @@ class TakenError(RunFolderError):
 
 
 @contextmanager
-def claimed(folder: Path) -> Iterator[None]:
+def claimed(folder: Path, *, to_read: bool = False) -> Iterator[None]:
     """Keep other processes out of a folder; whatever ends this process lets it go.
 
     Args:
         folder: made if it is not there, and removed again if it stays empty.
+        to_read: others may read it as well.
 
     Raises:
         TakenError: another process is in it.
@@ -36,7 +37,7 @@ def claimed(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise RunFolderError(f"cannot use {folder}: {error.strerror}") from error
     try:
-        _lock(handle, folder)
+        _lock(handle, folder, to_read=to_read)
         try:
             yield
         finally:
@@ -46,11 +47,11 @@ def claimed(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def _lock(handle: int, folder: Path) -> None:
+def _lock(handle: int, folder: Path, *, to_read: bool) -> None:
     if fcntl is None:
         return
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, (fcntl.LOCK_SH if to_read else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError as error:
         raise TakenError(f"another process is at work in {folder}") from error
     except OSError:  # a file system without locks

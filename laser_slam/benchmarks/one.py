@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from laser_slam.backbones import REPLAY
+from laser_slam.backbones.base import Backbone
 from laser_slam.benchmarks.claims import TakenError, claimed
 from laser_slam.benchmarks.material import Material
 from laser_slam.benchmarks.measures import MEASURES, PROTOCOL_VERSION
@@ -145,10 +146,17 @@ class One:
         self, dataset: Dataset, config: Config, readiness: Readiness, on_progress: Progress
     ) -> None:
         backbone = readiness.backbone(self.config.backbone)
-        if self.place.is_shared:
-            with claimed(self.shared):
-                predict_once(dataset, self.config, self.shared, backbone, on_progress)
-            backbone = None
+        if not self.place.is_shared:
+            self._map(dataset, config, backbone, on_progress)
+            return
+        with claimed(self.shared):
+            predict_once(dataset, self.config, self.shared, backbone, on_progress)
+        with claimed(self.shared, to_read=True):
+            self._map(dataset, config, None, on_progress)
+
+    def _map(
+        self, dataset: Dataset, config: Config, backbone: Backbone | None, on_progress: Progress
+    ) -> None:
         pipeline = Pipeline(
             dataset, config, self.folder, backbone=backbone, on_progress=on_progress
         )

@@ -6,10 +6,11 @@ import logging
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from laser_slam.benchmarks.claims import TakenError
+from laser_slam.benchmarks.claims import TakenError, claimed
 from laser_slam.benchmarks.material import Material
 from laser_slam.benchmarks.one import One, Place
 from laser_slam.benchmarks.outcome import NOT_YET, Outcome
@@ -131,7 +132,8 @@ class Bench:
             return
         if not any(work.done[run.key].reason for run in runs):
             for folder in {run.shared for run in runs}:
-                shutil.rmtree(folder, ignore_errors=True)
+                with suppress(TakenError), claimed(folder):  # another process may read it
+                    shutil.rmtree(folder, ignore_errors=True)
 
 
 class _Work:
@@ -177,6 +179,8 @@ class _Work:
         is_new, reason = run.key in self._to_do and not run.is_finished, None
         if not run.is_finished:
             reason = self._absent.get(run.name) or self._readiness.why_not(run.config)
+        if is_new and not reason:
+            logger.info("%s, %s", *run.key)
         start_s = time.monotonic()
         try:
             found = run.without(reason) if reason else run.outcome(self._readiness, on_progress)

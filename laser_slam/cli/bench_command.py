@@ -42,8 +42,8 @@ SettingOption = Annotated[
     list[str] | None,
     typer.Option(
         "--setting",
-        help="A row: NAME=section.key=value,...; or one of the table's. Repeatable. [all of the "
-        "table's]",
+        help="A row: NAME=section.key=value,...; or the name of one of the table's; repeatable. "
+        "Default: all of the table's.",
     ),
 ]
 OnlyOption = Annotated[
@@ -75,7 +75,7 @@ OutOption = Annotated[
     typer.Option(
         "--out",
         help="Holds all runs; the same command goes on where it stopped, and several may work at "
-        "once. [runs/TABLE]",
+        "once. Default: runs/TABLE.",
     ),
 ]
 PageOption = Annotated[
@@ -132,7 +132,7 @@ def bench(
     table: Annotated[
         str | None,
         typer.Argument(
-            metavar="[TABLE]",
+            metavar="TABLE",
             help="here, kitti, depth, pose, points, waymo or ablation; a YAML file of your own; "
             "none: list them.",
         ),
