@@ -230,8 +230,8 @@ def test_points_before_a_wall_are_as_far_from_it_as_they_are() -> None:
     wall = np.stack(np.meshgrid([10.0], np.arange(-5, 5, 0.05), np.arange(-3, 3, 0.05)), -1)
     scan = wall.reshape(-1, 3)
     for offset, shares in ((0.05, [1, 1, 1]), (0.15, [0, 1, 1]), (0.4, [0, 0, 1])):
-        distances = ScanDistances(scan[::11] - [offset, 0, 0])
-        distances.add(np.eye(4), scan)
+        distances = ScanDistances(scan[::11] - [offset, 0, 0], np.eye(4)[None])
+        distances.add(0, scan)
         errors = cloud_errors(distances.distances)
         assert errors.median_m is not None
         assert abs(errors.median_m - offset) < 0.02
@@ -242,9 +242,9 @@ def test_points_before_a_wall_are_as_far_from_it_as_they_are() -> None:
 def test_points_outside_the_field_of_every_scan_are_not_compared() -> None:
     scan = np.stack(np.meshgrid([10.0], np.arange(-5, 5, 0.1), np.arange(-2, 1, 0.1)), -1)
     roof, wall, beyond = np.array([10.0, 0, 6]), np.array([10.0, 0, 0]), np.array([300.0, 0, 0])
-    distances = ScanDistances(np.stack([roof, wall, beyond]))
+    distances = ScanDistances(np.stack([roof, wall, beyond]), np.eye(4)[None])
     assert cloud_errors(distances.distances).median_m is None
-    distances.add(np.eye(4), scan.reshape(-1, 3))
+    distances.add(0, scan.reshape(-1, 3))
     errors = cloud_errors(distances.distances)
     assert errors.num_points == 1
     assert errors.coverage == pytest.approx(1 / 3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,9 @@ from scipy.spatial import cKDTree
 Array = NDArray[np.float64]
 
 REACH_M = 50.0  # points further from every scanner are not compared: its lines are 35 cm apart
+NEAREST_SCANS = 16  # those farther off hardly ever have a nearer laser point, and take time
 BEYOND_M = 5.0  # distances are not told further than this
+_AT_ONCE = 1 << 16  # points whose scans are looked up
 RIM = 0.5  # percent of a scan's points above and below its field: strays
 
 
@@ -39,45 +42,65 @@ class CloudErrors:
 class ScanDistances:
     """Distances of a cloud from scans that come one after another; only one is held at a time.
 
-    A point is compared with every scan within ``REACH_M`` that has it in its vertical field of
-    view, and keeps the smallest distance. What lies outside all of them, such as roofs, says
-    nothing.
+    A point is compared with the ``NEAREST_SCANS`` that were taken nearest to it, of those within
+    ``REACH_M`` that have it in their vertical field of view, and keeps the smallest distance. What
+    lies outside all of them, such as roofs, says nothing.
 
     Attributes:
         distances: (N,) metres, infinite beyond ``BEYOND_M``; NaN: not compared.
     """
 
-    def __init__(self, points: Array) -> None:
+    def __init__(self, points: Array, world_from_scanner: Array) -> None:
         """Start.
 
         Args:
             points: (N, 3) of the cloud, in metres, in the world of the scans.
+            world_from_scanner: (K, 4, 4) rigid, metres, of the scans to come, in their order.
         """
         self._points = points
+        self._poses = world_from_scanner
+        self._rows = _rows_by_scan(points, world_from_scanner[:, :3, 3])
         self.distances = np.full(len(points), np.nan)
 
-    def add(self, world_from_scanner: Array, scan: Array, workers: int = 1) -> None:
+    def add(self, index: int, scan: Array, workers: int = 1) -> None:
         """Compare with one more scan.
 
         Args:
-            world_from_scanner: (4, 4) rigid, metres.
+            index: which of them.
             scan: (M, 3) points in the scanner's axes (z up).
             workers: threads.
         """
-        scan = scan[np.linalg.norm(scan, axis=1) < REACH_M + BEYOND_M]
-        if not len(scan):
-            return
+        rows = self._rows[index]
+        world_from_scanner = self._poses[index]
         center, turn = world_from_scanner[:3, 3], world_from_scanner[:3, :3]
-        near = np.flatnonzero(((self._points - center) ** 2).sum(axis=1) < REACH_M**2)
-        seen = (self._points[near] - center) @ turn
+        seen = (self._points[rows] - center) @ turn
+        far = np.linalg.norm(seen, axis=1).max(initial=0)
+        scan = scan[np.linalg.norm(scan, axis=1) < far + BEYOND_M]
+        if not len(rows) or not len(scan):
+            return
         low, high = np.percentile(_elevation(scan), [RIM, 100 - RIM])
         elevation = _elevation(seen)
         is_inside = (elevation >= low) & (elevation <= high)
-        rows = near[is_inside]
-        # As found: balancing the tree takes twice the time of all the rest.
+        rows = rows[is_inside]
+        # Not balanced: that takes longer than all the rest.
         tree = cKDTree(scan, balanced_tree=False, compact_nodes=False)
         found, _ = tree.query(seen[is_inside], distance_upper_bound=BEYOND_M, workers=workers)
         self.distances[rows] = np.fmin(self.distances[rows], found)
+
+
+def _rows_by_scan(points: Array, centers: Array) -> list[NDArray[np.intp]]:
+    """Return for each scan the rows of the points that it is among the nearest to."""
+    num = min(NEAREST_SCANS, len(centers))
+    tree, nearest = cKDTree(centers), np.empty((len(points), num), np.int32)
+    for start in range(0, len(points), _AT_ONCE):
+        rows = slice(start, start + _AT_ONCE)
+        _, nearest[rows] = tree.query(
+            points[rows], k=[*range(1, num + 1)], distance_upper_bound=REACH_M
+        )
+    scans = nearest.ravel()
+    order = np.argsort(scans, kind="stable")
+    ends = np.searchsorted(scans[order], np.arange(len(centers) + 1))
+    return [order[start:end] // num for start, end in pairwise(ends)]
 
 
 def cloud_errors(distances: Array) -> CloudErrors:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ Array = NDArray[np.float64]
 MOST_POINTS = 300_000  # of the map, evenly taken
 MOST_LASER_POINTS = 1_000_000  # of the file of scans
 SCANS_APART_M = 1.0  # scans from nearer together say the same of the map
+MOST_SCANS = 2000
 MAP_PLY, SCANS_PLY, PICTURE = "map_to_scans.ply", "scans.ply", "map_to_scans.png"
 LIMITS_M = (0.1, 0.2, 0.5)
 COLORS = np.array(  # within each limit, beyond all, not compared
@@ -58,15 +58,15 @@ def compare_surfaces(
     """
     velodyne, lidar = scans
     whole, by_pieces = lidar_from_world.apply(cloud.points), pieces.apply(cloud.points)
-    distances = ScanDistances(np.concatenate([whole, by_pieces]))
     chosen = _spaced(lidar)
+    world_from_scanner = lidar.world_from_cam[chosen] @ velodyne.rig.cam_from_velo
+    distances = ScanDistances(np.concatenate([whole, by_pieces]), world_from_scanner)
     laser = []
-    for done, row in enumerate(chosen, start=1):
-        world_from_scanner = lidar.world_from_cam[row] @ velodyne.rig.cam_from_velo
-        scan = velodyne.points(int(lidar.frames[row]))
-        distances.add(world_from_scanner, scan, num_threads())
-        laser.append(_thinned(scan, world_from_scanner, MOST_LASER_POINTS // len(chosen)))
-        watch("comparing the map", done, len(chosen))
+    for index, frame in enumerate(lidar.frames[chosen]):
+        scan = velodyne.points(int(frame))
+        distances.add(index, scan, num_threads())
+        laser.append(_thinned(scan, world_from_scanner[index], MOST_LASER_POINTS // len(chosen)))
+        watch("comparing the map", index + 1, len(chosen))
     drifted, still = np.split(distances.distances, 2)
     voxel_size = cloud.voxel_size * lidar_from_world.scale
     colored = Cloud(by_pieces, _colors(still), cloud.weights, voxel_size)
@@ -81,12 +81,14 @@ def compare_surfaces(
     }
 
 
-def _spaced(lidar: Trajectory) -> Sequence[int]:
+def _spaced(lidar: Trajectory) -> list[int]:
     """Choose rows of scans that are not all taken from the same place."""
+    distances = path_distances(lidar)
+    apart_m = max(SCANS_APART_M, float(distances[-1]) / MOST_SCANS)
     rows: list[int] = []
     last_m = -np.inf
-    for row, at_m in enumerate(path_distances(lidar)):
-        if at_m - last_m >= SCANS_APART_M:
+    for row, at_m in enumerate(distances):
+        if at_m - last_m >= apart_m:
             rows.append(row)
             last_m = at_m
     return rows
