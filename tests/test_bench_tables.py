@@ -261,6 +261,13 @@ def test_a_section_tells_only_of_what_was_run() -> None:
     assert "\n\n\n" not in text
 
 
+def test_a_section_tells_what_settings_its_sequences_need() -> None:
+    table = load_table("here")
+    asked = [ate(name, 1.0) for name in ("office", *table.groups["paths"])]
+    text = Report("here", table, [Setting("ours")], asked, "").section(fill_grids(table, asked))
+    assert "the loops are what counts; `dataset.fps=30.0`\n- paths (11): `backbone.name=sim" in text
+
+
 def test_a_page_gets_the_words_of_today_and_keeps_the_tables_of_others(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     put_on_page(page, "a", "## A\n\n1")

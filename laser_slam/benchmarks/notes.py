@@ -27,7 +27,7 @@ class Note:
 
     def line(self, groups: Mapping[str, Sequence[str]]) -> str:
         """Return it as a line, groups of sequences by their names."""
-        about = ", ".join(_name_groups(self.sequences, groups))
+        about = ", ".join(name_groups(self.sequences, groups))
         rows = f" ({', '.join(self.settings)})" if self.settings else ""
         return f"{about}{rows}: {self.text}"
 
@@ -90,7 +90,7 @@ def _shorten(note: Note, rows: Sequence[str]) -> Note:
     return Note(note.text, note.sequences) if is_all else note
 
 
-def _name_groups(sequences: Sequence[str], groups: Mapping[str, Sequence[str]]) -> list[str]:
+def name_groups(sequences: Sequence[str], groups: Mapping[str, Sequence[str]]) -> list[str]:
     """Name whole groups instead of their members, the largest first."""
     left, named = list(sequences), []
     for name, members in sorted(groups.items(), key=lambda item: -len(item[1])):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from laser_slam import __version__
 from laser_slam.benchmarks.grid import Grid, fill_grids
+from laser_slam.benchmarks.notes import name_groups
 from laser_slam.benchmarks.outcome import Outcome
 from laser_slam.benchmarks.settings import Setting
 from laser_slam.benchmarks.table import Table
@@ -84,10 +85,16 @@ class Report:
             yield f"- **{setting.name}**: {own}"
 
     def _sequences(self) -> Iterator[str]:
+        """Tell of the sequences that were asked for what is to know, once where it is the same."""
         asked = {outcome.sequence for outcome in self.outcomes}
+        told: dict[tuple[str, tuple[str, ...]], list[str]] = {}
         for name, spec in self.table.sequences.items():
-            if spec.note and name in asked:
-                yield f"- {name}: {spec.note}"
+            if name in asked and (spec.note or spec.settings):
+                told.setdefault((spec.note, spec.settings), []).append(name)
+        for (note, settings), names in told.items():
+            with_these = f"`{' '.join(settings)}`" if settings else ""
+            what = "; ".join(part for part in (note, with_these) if part)
+            yield f"- {', '.join(name_groups(names, self.table.groups))}: {what}"
 
 
 def save_table(out: Path, report: Report, page: Path | None = None) -> list[Path]:
