@@ -18,10 +18,11 @@ from laser_slam.benchmarks import Bench, Material, Setting, load_table, parse_se
 from laser_slam.benchmarks.claims import TakenError, claimed
 from laser_slam.benchmarks.outcome import NOT_YET
 from laser_slam.benchmarks.pace import Pace
-from laser_slam.benchmarks.table import parse_table
+from laser_slam.benchmarks.table import SequenceSpec, parse_table
 from laser_slam.cli import app
 from laser_slam.cli.bench_command import BenchFlags
-from laser_slam.config import SyntheticConfig
+from laser_slam.config import Config, SyntheticConfig
+from laser_slam.datasets.base import Dataset
 from laser_slam.datasets.synthetic.drive import SyntheticDrive
 from laser_slam.datasets.synthetic.save import save_kitti_layout
 from laser_slam.errors import ConfigError, WeightsError
@@ -155,6 +156,32 @@ def test_after_each_run_all_outcomes_are_handed_on(data: Path, tmp_path: Path) -
         ["03", "04", "03", NOT_YET],
         ["03", "04", "03", "04"],
     ]
+
+
+def test_an_input_is_opened_once_for_all_rows_of_it(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And once before, to see that it is there."""
+    opened: list[object] = []
+    open_it = Material.open
+
+    def counted(self: Material, spec: SequenceSpec, config: Config) -> Dataset:
+        opened.append(spec.arguments["sequence"])
+        return open_it(self, spec, config)
+
+    monkeypatch.setattr(Material, "open", counted)
+    found = work(data, tmp_path).run([PLAIN, NO_LAYERS])
+    assert all(one.scores for one in found)
+    assert opened == ["03", "04", "03", "04"]
+
+
+def test_a_wrong_name_of_a_sequence_gets_a_hint() -> None:
+    bench = Bench(load_table("pose"), Material(None), Path("out"), only=("sintel-aley_2",))
+    with pytest.raises(ConfigError) as error:
+        bench.sequences()
+    assert "no such sequence (did you mean sintel-alley_2?); there is sintel, " in str(error.value)
+    assert "--list shows all" in str(error.value)
+    assert len(str(error.value)) < 400
 
 
 def test_two_processes_share_the_work(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from laser_slam.benchmarks.stretch import Stretch
 from laser_slam.benchmarks.table import SequenceSpec
-from laser_slam.config import Config
+from laser_slam.config import Config, SyntheticConfig
 from laser_slam.datasets import DATASETS
 from laser_slam.datasets.base import Dataset
 from laser_slam.dependencies import import_named
@@ -86,6 +86,19 @@ def _without_name(refusal: str, spec: SequenceSpec) -> str:
 def _not_there(spec: SequenceSpec) -> str:
     folders = [place.rpartition("/")[0] for place in spec.at if "/" in place] or spec.at
     return f"not there, in {' or '.join(dict.fromkeys(folders))} of the data folder"
+
+
+class LastOpened:
+    """The input that was opened last: the rows of a sequence follow one another."""
+
+    def __init__(self) -> None:
+        self._known: tuple[SequenceSpec, SyntheticConfig, Dataset] | None = None
+
+    def open(self, material: Material, spec: SequenceSpec, config: Config) -> Dataset:
+        """Open an input, or return it if it is the last one; see ``Material.open``."""
+        if self._known is None or self._known[:2] != (spec, config.synthetic):
+            self._known = spec, config.synthetic, material.open(spec, config)
+        return self._known[2]
 
 
 def _open_at(spec: SequenceSpec, path: Path, config: Config) -> Dataset:

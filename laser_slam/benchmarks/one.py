@@ -13,7 +13,7 @@ from typing import Any
 from laser_slam.backbones import REPLAY
 from laser_slam.backbones.base import Backbone
 from laser_slam.benchmarks.claims import TakenError, claimed
-from laser_slam.benchmarks.material import Material
+from laser_slam.benchmarks.material import LastOpened, Material
 from laser_slam.benchmarks.measures import MEASURES, PROTOCOL_VERSION
 from laser_slam.benchmarks.outcome import Outcome
 from laser_slam.benchmarks.protocols import PROTOCOLS
@@ -93,14 +93,19 @@ class One:
         """Tell whether it was run before."""
         return (self.folder / REPORT).exists()
 
-    def outcome(self, readiness: Readiness, on_progress: Progress) -> Outcome:
+    def outcome(self, readiness: Readiness, opened: LastOpened, on_progress: Progress) -> Outcome:
         """Run it if it has not been run, and score it; what fails becomes a reason.
+
+        Args:
+            readiness: has networks.
+            opened: has the input if it was that of the run before.
+            on_progress: called with a stage's name, how much is done and of how much.
 
         Raises:
             TakenError: another process is at it.
         """
         try:
-            dataset = self.place.material.open(self.spec, self.config)
+            dataset = opened.open(self.place.material, self.spec, self.config)
             with claimed(self.folder):
                 scores = self._scores(dataset, readiness, on_progress)
         except TakenError:

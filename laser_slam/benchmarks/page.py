@@ -27,7 +27,7 @@ laser-slam bench kitti --data DATA --list   # its rows and sequences, and which 
 laser-slam bench kitti --data DATA          # runs them and prints the table; goes on if broken off
 laser-slam bench kitti --data DATA --only 03,06 --backbone pi3 --page docs/results.md
 laser-slam bench here --share --setting ours --setting short=windows.size=10,windows.overlap=3
-laser-slam bench my-table.yaml --data DATA  # a table of your own, written as the shipped ones are
+laser-slam bench my-table.yaml --data DATA  # a table as those in laser_slam/benchmarks/tables
 ```
 
 DATA holds the data sets as [datasets.md](datasets.md) describes them, each in a folder of its own

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
 import shutil
 import time
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from laser_slam.benchmarks.claims import TakenError, claimed
-from laser_slam.benchmarks.material import Material
+from laser_slam.benchmarks.material import LastOpened, Material
 from laser_slam.benchmarks.one import One, Place
 from laser_slam.benchmarks.outcome import NOT_YET, Outcome
 from laser_slam.benchmarks.pace import Pace, in_words
@@ -24,6 +25,7 @@ from laser_slam.errors import ConfigError
 
 logger = logging.getLogger(__name__)
 
+MOST_NAMED = 15  # sequences and groups in an error
 OnOutcomes = Callable[[list[Outcome]], object]
 
 
@@ -69,8 +71,13 @@ class Bench:
         groups = {**self.table.groups, **{name: (name,) for name in self.table.sequences}}
         unknown = [name for name in self.only if name not in groups]
         if unknown:
-            there = ", ".join(groups)
-            raise ConfigError(f"--only {unknown[0]}: no such sequence; there is {there}")
+            near = difflib.get_close_matches(unknown[0], groups, n=1)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            there = ", ".join(list(groups)[:MOST_NAMED])
+            more = ", ... (--list shows all)" if len(groups) > MOST_NAMED else ""
+            raise ConfigError(
+                f"--only {unknown[0]}: no such sequence{hint}; there is {there}{more}"
+            )
         wanted = {name for group in self.only for name in groups[group]}
         return [name for name in self.table.sequences if name in wanted or not self.only]
 
@@ -142,7 +149,7 @@ class _Work:
     def __init__(self, runs: list[One]) -> None:
         self.runs = runs
         self.done: dict[tuple[str, str], Outcome] = {}
-        self._readiness = Readiness()
+        self._readiness, self._opened = Readiness(), LastOpened()
         self._absent: dict[str, str] = {}
         frames: dict[str, int] = {}
         self._to_do: dict[tuple[str, str], One] = {}
@@ -182,8 +189,9 @@ class _Work:
         if is_new and not reason:
             logger.info("%s, %s", *run.key)
         start_s = time.monotonic()
+        tools = self._readiness, self._opened
         try:
-            found = run.without(reason) if reason else run.outcome(self._readiness, on_progress)
+            found = run.without(reason) if reason else run.outcome(*tools, on_progress)
         except TakenError as error:
             if is_last:
                 self.done[run.key] = run.without(f"{error}: run this again when it has ended")
