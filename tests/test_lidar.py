@@ -355,12 +355,34 @@ def test_unrectified_images_are_refused(tmp_path: Path) -> None:
         KittiRaw(drive)
 
 
-def test_kiss_icp_is_named_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kiss_icp_is_named_where_it_is_missing_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "kiss_icp", None)
     import_kiss_icp.cache_clear()
-    with pytest.raises(DependencyError, match=r"pip install 'laser-slam\[lidar\]'"):
-        next(iter(track_scans([Turn(0, np.zeros((1, 3)))])))
+    root, out = scans.write_kitti(tmp_path / "kitti", 3), tmp_path / "out"
+    command = ["lidar", "kitti", "0", "--root", str(root), "--out", str(out), "--quiet"]
+    result = CliRunner().invoke(app, command)
     import_kiss_icp.cache_clear()
+    assert result.exit_code == 1, result.output
+    assert "install it: pip install 'laser-slam[lidar]'" in result.output
+    assert not out.exists()
+
+
+def test_a_raw_drive_is_opened_by_its_date_alone(tmp_path: Path) -> None:
+    drive = scans.write_raw(tmp_path / "drive", 3)
+    for name in ("cam_to_cam", "velo_to_cam"):
+        (tmp_path / f"calib_{name}.txt").unlink()
+    for path in (drive / "image_02/data").iterdir():
+        write_png(path, np.full((375, 1242, 3), 90, np.uint8))
+    info = KittiRaw(drive, Path("2011_09_26")).info
+    assert info.intrinsics_source == "KITTI's calibration of 2011_09_26, row P_rect_02"
+    assert info.intrinsics is not None
+    np.testing.assert_allclose(info.intrinsics[:, 2], [609.5593, 172.854, 1])
+    with pytest.raises(DatasetError, match=r"or, for KITTI's own drives, the date: 2011_09_26, "):
+        KittiRaw(drive)
+    with pytest.raises(DatasetError, match=r"cannot read 2011_09_27/calib_cam_to_cam.txt"):
+        KittiRaw(drive, Path("2011_09_27"))
 
 
 @pytest.mark.parametrize("date", DAYS)

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import logging
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.datasets.decoding import (
-    SUFFIXES,
-    Stream,
-    check_same_kind,
-    give_up_if_unreadable,
-    read_ahead,
-    read_image,
-)
+from laser_slam.datasets.decoding import SUFFIXES, check_same_kind
 from laser_slam.datasets.kitti_calibration import raw_rig
 from laser_slam.datasets.kitti_dates import DAYS
-from laser_slam.datasets.velodyne import Depth, Velodyne, find_scans
+from laser_slam.datasets.lens import Lens
+from laser_slam.datasets.listed import ListedSequence, Shot
+from laser_slam.datasets.velodyne import Velodyne, find_scans, project_scan, read_scan
 from laser_slam.errors import DatasetError
-from laser_slam.types import Frame, SequenceInfo
 
 Array = NDArray[np.float64]
 
@@ -35,7 +29,7 @@ CALIBRATION_ADVICE = (
 logger = logging.getLogger(__name__)
 
 
-class KittiRaw:
+class KittiRaw(ListedSequence):
     """A drive: ``image_02/data``, ``image_02/timestamps.txt`` and ``velodyne_points/data``.
 
     The files may also lie in ``image_02`` and ``velodyne_points`` themselves. Without timestamps
@@ -53,48 +47,28 @@ class KittiRaw:
         DatasetError: images or calibration are missing or malformed.
     """
 
+    again = AGAIN
+
     def __init__(
         self, folder: Path, calibration: Path | None = None, camera: str | None = None
     ) -> None:
-        self._folder = folder
-        self._images_folder, self._paths = _find_images(folder, camera)
-        size = check_same_kind(self._paths, AGAIN).size
-        name = folder.resolve().name
+        images, paths = _find_images(folder, camera)
+        camera = images.relative_to(folder).parts[0]
         where = calibration or _find_calibration(folder)
-        camera = self._images_folder.relative_to(folder).parts[0]
-        self._rig = raw_rig(where, camera, size, CALIBRATION_ADVICE)
-        self._times_s = _read_times(folder / camera / "timestamps.txt", len(self._paths))
-        self._info = SequenceInfo(
-            f"kitti-raw-{name}",
-            size,
-            len(self._paths),
-            self._rig.intrinsics,
-            f"{_calibration_name(where)}, row P_rect_{camera[-2:]}",
-            files=tuple(self._paths),
+        size = check_same_kind(paths[:1], AGAIN).size
+        self._rig = rig = raw_rig(where, camera, size, CALIBRATION_ADVICE)
+        self._scans_folder = folder / "velodyne_points"
+        self._times_s = _read_times(folder / camera / "timestamps.txt", len(paths))
+        scans = self._scans_if_any()
+        super().__init__(
+            f"kitti-raw-{folder.resolve().name}",
+            [
+                Shot(float(time_s), path, scans.get(frame))
+                for frame, (time_s, path) in enumerate(zip(self._times_s, paths, strict=True))
+            ],
+            Lens(rig.intrinsics, f"{_calibration_name(where)}, row P_rect_{camera[-2:]}"),
+            lambda scan, _size: project_scan(read_scan(scan), rig),
         )
-        self._velodyne = self._find_velodyne()
-
-    @property
-    def info(self) -> SequenceInfo:
-        """Say what is known before the images are read."""
-        return self._info
-
-    def frames(self) -> Stream[Frame]:
-        """Read the images in order, a few ahead; an unreadable one comes as None.
-
-        Raises:
-            DatasetError: the first image or more than half of all are unreadable.
-        """
-        jobs = (partial(self._read, index) for index in range(len(self._paths)))
-        return give_up_if_unreadable(read_ahead(jobs), self._images_folder, len(self._paths))
-
-    def true_depth(self, frame: int) -> Depth | None:
-        """Return the (H, W) depth z in metres that LiDAR saw, NaN: unknown; None: no scan.
-
-        Raises:
-            DatasetError: the scan is broken.
-        """
-        return None if self._velodyne is None else self._velodyne.depth(frame)
 
     def velodyne(self) -> Velodyne:
         """Return the LiDAR scans of the drive, as the scanner turned: not compensated.
@@ -102,21 +76,18 @@ class KittiRaw:
         Raises:
             DatasetError: there are none.
         """
-        paths = find_scans(_inner(self._folder / "velodyne_points"), len(self._paths))
+        paths = find_scans(_inner(self._scans_folder), len(self._times_s))
         return Velodyne(paths, self._times_s, self._rig, is_compensated=False)
 
-    def _find_velodyne(self) -> Velodyne | None:
+    def _scans_if_any(self) -> Mapping[int, Path]:
         """Look for scans, without which a drive can be mapped as well."""
-        if not (self._folder / "velodyne_points").is_dir():
-            return None
+        if not self._scans_folder.is_dir():
+            return {}
         try:
-            return self.velodyne()
+            return self.velodyne().paths
         except DatasetError as error:
             logger.warning("no depth from LiDAR: %s", error)
-            return None
-
-    def _read(self, index: int) -> Frame:
-        return Frame(index, float(self._times_s[index]), read_image(self._paths[index]))
+            return {}
 
 
 def _inner(folder: Path) -> Path:

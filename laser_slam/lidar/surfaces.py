@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 MOST_POINTS = 300_000  # of the map, evenly taken
 MOST_LASER_POINTS = 1_000_000  # of the file of scans
-SCANS_APART_M = 1.0  # scans from nearer together say the same of the map
+SCANS_APART_M = 0.5  # scans from nearer together say the same of the map
 MOST_SCANS = 2000
 MAP_PLY, SCANS_PLY, PICTURE = "map_to_scans.ply", "scans.ply", "map_to_scans.png"
 LIMITS_M = (0.1, 0.2, 0.5)
