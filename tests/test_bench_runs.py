@@ -435,8 +435,8 @@ blocks: [{title: errors, columns: [{name: ATE, measure: ate_m, over: "04"}]}]
 
 
 def test_the_command_of_a_table_names_all_that_its_numbers_depend_on() -> None:
-    flags = BenchFlags(data=Path("/x"), only="03", share=True, lean=True, set=["run.samples=3"])
-    told = "laser-slam bench kitti --only 03 --set run.samples=3 --share --lean --data DATA"
+    flags = BenchFlags(data=Path("/x"), only="03", config="/y/mine.yaml", share=True, lean=True)
+    told = "laser-slam bench kitti --only 03 --config mine.yaml --share --lean --data DATA"
     assert flags.command("kitti") == told
 
 

@@ -84,8 +84,8 @@ def _without_name(refusal: str, spec: SequenceSpec) -> str:
 
 
 def _not_there(spec: SequenceSpec) -> str:
-    folders = [place.rpartition("/")[0] for place in spec.at if "/" in place] or spec.at
-    return f"not there, in {' or '.join(dict.fromkeys(folders))} of the data folder"
+    folder = spec.at[0].partition("/")[0]
+    return f"not there, neither in {folder} nor elsewhere in the data folder"
 
 
 class LastOpened:

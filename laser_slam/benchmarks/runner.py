@@ -13,6 +13,7 @@ from pathlib import Path
 
 from laser_slam.benchmarks.claims import TakenError, claimed
 from laser_slam.benchmarks.material import LastOpened, Material
+from laser_slam.benchmarks.notes import name_groups
 from laser_slam.benchmarks.one import One, Place
 from laser_slam.benchmarks.outcome import NOT_YET, Outcome
 from laser_slam.benchmarks.pace import Pace, in_words
@@ -173,8 +174,9 @@ class _Work:
             num, num - num_without - num_left, num_without, num_left,
         )  # fmt: skip
         for reason in dict.fromkeys(self._absent.values()):
-            names = ", ".join(name for name, why in self._absent.items() if why == reason)
-            logger.warning("%s: %s", names, reason)
+            names = [name for name, why in self._absent.items() if why == reason]
+            groups = self.runs[0].place.table.groups
+            logger.warning("%s: %s", ", ".join(name_groups(names, groups)), reason)
         self._readiness.check(run.config for run in self._to_do.values())
 
     def left(self) -> list[One]:

@@ -115,7 +115,7 @@ class BenchFlags:
         for flag, value in (
             ("--only", self.only),
             ("--backbone", self.backbone),
-            ("--config", self.config),
+            ("--config", None if self.config is None else Path(self.config).name),
         ):
             parts += [] if value is None else [flag, value]
         for flag, values in (("--setting", self.setting), ("--set", self.set)):
