@@ -17,6 +17,7 @@ from laser_slam.benchmarks import (
     as_markdown,
     fill_grids,
     load_table,
+    parse_settings,
     print_grids,
     table_names,
 )
@@ -119,6 +120,18 @@ def test_ablations_are_of_the_videos_of_the_depth_table() -> None:
     assert list(ablation.sequences)[:28] == names
     assert [ablation.sequences[name] for name in names] == [depth.sequences[name] for name in names]
     assert ablation.groups["bonn"] == depth.groups["bonn"]
+
+
+def test_each_table_of_ablations_is_one_word() -> None:
+    table = load_table("ablation")
+    names = [setting.name for setting in parse_settings(["L", "O"], table)]
+    assert names == ["ours", "L 10", "L 40", "O 2", "O 10"]  # what is in both is run once
+    grouped = {name for names in table.row_groups.values() for name in names}
+    assert grouped == set(table.rows)
+    with pytest.raises(ConfigError, match=r"row of the table \(layers, tau, registration"):
+        parse_settings(["taw"], table)
+    with pytest.raises(ConfigError, match="row group L: no row shorter"):
+        parse_table("{title: t, row_groups: {L: [shorter]}, sequences: {}, blocks: []}")
 
 
 def test_what_cannot_be_borrowed_says_so() -> None:

@@ -64,7 +64,8 @@ class Material:
         """Return the places that are there, and whether they hold the chosen frames alone."""
         if self.root is None:
             raise DatasetError(
-                f"needs {spec.at[0]}; pass --data, or set LASER_SLAM_DATA, to the folder of it"
+                f"needs {spec.at[0].partition('/')[0]}; pass --data, or set LASER_SLAM_DATA, to "
+                "the folder that holds it"
             )
         return [
             (path, places is spec.prepared)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence, Sized
+from collections.abc import Iterator, Mapping, Sequence, Sized
 
+from laser_slam.benchmarks.notes import name_groups
 from laser_slam.benchmarks.one import One
 from laser_slam.benchmarks.runner import Bench
 from laser_slam.benchmarks.settings import Setting
@@ -24,17 +25,21 @@ def list_rows(settings: Sequence[Setting]) -> Iterator[tuple[str, str]]:
         yield setting.name, " ".join(setting.assignments) or "no setting of its own"
 
 
-def list_groups(bench: Bench) -> Iterator[tuple[str, str]]:
-    """Give the name of each group of sequences, and its members."""
-    for name, members in bench.table.groups.items():
+def list_groups(groups: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, str]]:
+    """Give the name of each group of rows or sequences, and its members."""
+    for name, members in groups.items():
         yield name, ", ".join(members)
 
 
 def list_sequences(bench: Bench, settings: Sequence[Setting]) -> Iterator[tuple[str, str]]:
-    """Give the name of each sequence, and whether it is there and was run."""
+    """Give the names of sequences, and whether they are there and were run, equal ones together."""
     runs = bench.runs(settings)
+    by_state: dict[str, list[str]] = {}
     for name in bench.sequences():
-        yield name, _state([run for run in runs if run.name == name])
+        state = _state([run for run in runs if run.name == name])
+        by_state.setdefault(state, []).append(name)
+    for state, names in by_state.items():
+        yield ", ".join(name_groups(names, bench.table.groups)), state
 
 
 def _state(runs: Sequence[One]) -> str:

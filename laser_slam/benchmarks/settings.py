@@ -27,10 +27,10 @@ class Setting:
 
 
 def parse_settings(given: Sequence[str], table: Table) -> list[Setting]:
-    """Read ``NAME=key=value,key=value``, or the name of a row of the table; none: all its rows.
+    """Read ``NAME=key=value,key=value``, or names of rows or row groups; none: all rows.
 
     Raises:
-        ConfigError: a name is missing, given twice, or alone and not that of a row.
+        ConfigError: a name is missing, given twice, or alone and neither of a row nor of a group.
 
     >>> from laser_slam.benchmarks.table import load_table
     >>> parse_settings(["short=windows.size=10,windows.overlap=3"], load_table("kitti"))
@@ -38,7 +38,8 @@ def parse_settings(given: Sequence[str], table: Table) -> list[Setting]:
     """
     if not given:
         return [Setting(name, assignments) for name, assignments in table.rows.items()]
-    settings = [_parse(text, table) for text in given]
+    # A row may be in several groups.
+    settings = list(dict.fromkeys(setting for text in given for setting in _parse(text, table)))
     folders = [setting.folder for setting in settings]
     for name in folders:
         if folders.count(name) > 1:
@@ -46,14 +47,15 @@ def parse_settings(given: Sequence[str], table: Table) -> list[Setting]:
     return settings
 
 
-def _parse(text: str, table: Table) -> Setting:
+def _parse(text: str, table: Table) -> list[Setting]:
     name, equals, rest = (part.strip() for part in text.partition("="))
-    if not equals and name in table.rows:
-        return Setting(name, table.rows[name])
+    names = table.row_groups.get(name, (name,) if name in table.rows else ())
+    if not equals and names:
+        return [Setting(row, table.rows[row]) for row in names]
     if not equals or not NAME.fullmatch(name):
-        rows = ", ".join(table.rows)
+        rows = ", ".join([*table.row_groups, *table.rows])
         raise ConfigError(
             f"--setting wants NAME=section.key=value,... or a row of the table ({rows}), "
             f"got '{text}'"
         )
-    return Setting(name, tuple(part.strip() for part in _NEXT.split(rest) if part.strip()))
+    return [Setting(name, tuple(part.strip() for part in _NEXT.split(rest) if part.strip()))]

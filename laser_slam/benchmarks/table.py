@@ -140,6 +140,7 @@ class Table(_Part):
         about: what is measured and how, and what to know of the published rows.
         settings: ``section.key=value`` of all its runs, below those of the user.
         rows: what is compared, by name: the settings in which it differs.
+        row_groups: names of rows that are run together, by the name of their group.
         sequences: inputs by name.
         groups: names of sequences by the name of their group.
         borrowed: groups of shipped tables, by the table's name, that this one has with all their
@@ -151,6 +152,7 @@ class Table(_Part):
     about: str = ""
     settings: tuple[str, ...] = ()
     rows: dict[str, tuple[str, ...]] = Field(default={"ours": ()}, min_length=1)
+    row_groups: dict[str, tuple[str, ...]] = {}
     sequences: dict[str, SequenceSpec]
     groups: dict[str, tuple[str, ...]] = {}
     borrowed: dict[str, tuple[str, ...]] = {}
@@ -185,6 +187,14 @@ class Table(_Part):
                 unknown.add(column.over)
         if unknown:
             raise ValueError(f"no sequences {', '.join(sorted(unknown))}")
+        return self
+
+    @model_validator(mode="after")
+    def _row_groups_have_rows(self) -> Self:
+        for group, names in self.row_groups.items():
+            unknown = [name for name in names if name not in self.rows]
+            if unknown or group in self.rows:
+                raise ValueError(f"row group {group}: no row {', '.join(unknown) or 'itself'}")
         return self
 
     def members(self, column: Column) -> tuple[str, ...]:

@@ -42,8 +42,8 @@ SettingOption = Annotated[
     list[str] | None,
     typer.Option(
         "--setting",
-        help="A row: NAME=section.key=value,...; or the name of one of the table's; repeatable. "
-        "Default: all of the table's.",
+        help="A row: NAME=section.key=value,...; or the name of one of the table's, or of a group "
+        "of them; repeatable. Default: all of the table's.",
     ),
 ]
 OnlyOption = Annotated[
@@ -196,7 +196,8 @@ def _show_plan(work: Bench, settings: Sequence[Setting]) -> None:
 
     typer.echo(f"{work.table.title}\n\n{work.table.about.strip()}\n")
     _print_pairs("Rows", list_rows(settings))
-    _print_pairs("Groups, for --only", list_groups(work))
+    _print_pairs("Groups of rows, for --setting", list_groups(work.table.row_groups))
+    _print_pairs("Groups of sequences, for --only", list_groups(work.table.groups))
     _print_pairs("Sequences", list_sequences(work, settings))
 
 
