@@ -158,6 +158,15 @@ def test_after_each_run_all_outcomes_are_handed_on(data: Path, tmp_path: Path) -
     ]
 
 
+def test_a_table_that_grows_never_shows_less_than_before(data: Path, tmp_path: Path) -> None:
+    work(data, tmp_path).run([PLAIN])
+    seen: list[list[str | None]] = []
+    work(data, tmp_path).run(
+        [NO_LAYERS, PLAIN], on_outcomes=lambda found: seen.append([one.reason for one in found])
+    )
+    assert seen == [[None, NOT_YET, None, None], [None] * 4]
+
+
 def test_an_input_is_opened_once_for_all_rows_of_it(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -180,8 +180,9 @@ class _Work:
         self._readiness.check(run.config for run in self._to_do.values())
 
     def left(self) -> list[One]:
-        """Return what has not been looked at."""
-        return [run for run in self.runs if run.key not in self.done]
+        """Return what has not been looked at, finished runs first: then every table has them."""
+        left = [run for run in self.runs if run.key not in self.done]
+        return sorted(left, key=lambda run: not run.is_finished)
 
     def do(self, run: One, on_progress: Progress, *, is_last: bool) -> bool:
         """Have a run's outcome, unless another process is at it; tell whether it is a new one."""
