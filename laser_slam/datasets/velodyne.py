@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -25,6 +26,12 @@ AGAIN = "download the scans again"
 HIDING_SIDE_PX = 4
 HIDING_HEIGHT_PX = 7
 HIDING_RATIO = 0.85
+# The laser passes over near things at a distance from their outline that the places of scanner and
+# camera give; as much again, for dark or shiny tops of cars send nothing back.
+MUCH_NEARER = 0.6
+OUTLINE_MARGIN = 1.0
+LEAST_PARALLAX_PX = 1.5
+BANDS_M = (0.0, 2.0, 3.0, 4.0, 5.5, 7.5, 10.0, 14.0, 20.0, 28.0, 40.0)
 
 
 @dataclass(frozen=True)
@@ -147,7 +154,9 @@ def project_scan(points: Array, rig: Rig) -> Depth:
 
     The scanner looks over what hides things from the camera. So a pixel is left out where, within
     ``HIDING_SIDE_PX`` beside it, points less than ``HIDING_RATIO`` times as far lie both within
-    ``HIDING_HEIGHT_PX`` above and as much below it.
+    ``HIDING_HEIGHT_PX`` above and as much below it; and where it lies just past the outline of
+    something less than ``MUCH_NEARER`` times as far, which the scanner may see past, but not the
+    camera.
 
     Args:
         points: (N, 3) in metres, in the scanner's axes.
@@ -163,7 +172,8 @@ def project_scan(points: Array, rig: Rig) -> Depth:
     inside = ((pixels >= 0) & (pixels < [width, height])).all(axis=1)
     depth = np.full(rig.size, np.inf, np.float32)
     np.minimum.at(depth, (pixels[inside, 1], pixels[inside, 0]), seen[inside, 2])
-    depth[~np.isfinite(depth) | _is_hidden(depth)] = np.nan
+    is_hidden = _is_hidden(depth) | _is_behind_outline(depth, rig)
+    depth[~np.isfinite(depth) | is_hidden] = np.nan
     return depth
 
 
@@ -183,3 +193,28 @@ def _is_hidden(depth: Depth) -> NDArray[np.bool_]:
         for row in rows
     )
     return np.asarray((above < limit) & (below < limit))
+
+
+def _is_behind_outline(depth: Depth, rig: Rig) -> NDArray[np.bool_]:
+    """Tell which pixels the scanner alone may see, past the outlines of much nearer things.
+
+    A road is safe: between points of which one is much nearer, it falls off by more than that.
+    """
+    out = np.zeros(depth.shape, np.bool_)
+    for near_m, far_m in pairwise(BANDS_M):
+        parallax_px = rig.intrinsics[[0, 1], [0, 1]] * rig.cam_from_velo[:2, 3] / far_m
+        if np.abs(parallax_px).max() < LEAST_PARALLAX_PX:
+            break
+        band = np.where((depth >= near_m) & (depth < far_m), depth, np.float32(np.inf))
+        ends = np.rint(np.outer([1.0, -OUTLINE_MARGIN], parallax_px)).astype(int)
+        low, high = ends.min(axis=0) - [HIDING_SIDE_PX, 0], ends.max(axis=0) + [HIDING_SIDE_PX, 0]
+        width, height = (high - low + 1).tolist()
+        nearest = cv2.erode(
+            band,
+            np.ones((height, width), np.uint8),
+            anchor=(int(-low[0]), int(-low[1])),
+            borderType=cv2.BORDER_CONSTANT,
+            borderValue=float(np.finfo(np.float32).max),
+        )
+        out |= nearest < MUCH_NEARER * depth
+    return out
