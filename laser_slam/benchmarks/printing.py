@@ -38,7 +38,7 @@ def print_grids(
     if notes:
         console.print(Text("Notes", style="bold"))
     for note in notes:
-        console.print(Padding(Text(f"- {note}"), (0, 0, 0, 1)))
+        console.print(Padding(Text(f"- {note}"), (0, 0, 0, 1), expand=False))
 
 
 def _draw(grid: Grid, names: Sequence[Text], piece: range) -> Drawn:
