@@ -347,6 +347,20 @@ def test_faulty_scans_are_one_line(tmp_path: Path, fault: str) -> None:
     assert re.search(message, lines[0]), lines[0]
 
 
+@needs_kiss_icp
+@pytest.mark.parametrize("damage", [cut, lambda path: path.write_bytes(b"")], ids=["cut", "empty"])
+def test_a_scan_that_is_cut_off_is_known_before_any_is_tracked(
+    tmp_path: Path, damage: Callable[[Path], None]
+) -> None:
+    root, out = scans.write_kitti(tmp_path / "kitti", 3), tmp_path / "out"
+    damage(root / SEQUENCE / "velodyne/000002.bin")
+    command = ["lidar", "kitti", "00", "--root", str(root), "--out", str(out), "--quiet"]
+    result = CliRunner().invoke(app, command)
+    assert result.exit_code == 1
+    assert "000002.bin is no scan" in result.output
+    assert not out.exists()
+
+
 def test_a_raw_drive_with_an_empty_folder_of_scans_is_read_without_depth(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -65,6 +65,18 @@ class Velodyne:
     rig: Rig
     is_compensated: bool
 
+    def check_files(self) -> None:
+        """Look at the size of every file, so that a scan cut off is known before hours of work.
+
+        Raises:
+            DatasetError: one is missing, empty or cut off.
+        """
+        for path in self.paths.values():
+            try:
+                _check_size(path, path.stat().st_size)
+            except OSError as error:
+                raise DatasetError(f"cannot read {path} ({error.strerror}); {AGAIN}") from error
+
     def points(self, frame: int) -> Array:
         """Read a scan: (N, 3) points in metres, in the scanner's axes.
 
@@ -116,16 +128,20 @@ def read_scan(path: Path) -> Array:
         data = path.read_bytes()
     except OSError as error:
         raise DatasetError(f"cannot read {path} ({error.strerror}); {AGAIN}") from error
-    if not data or len(data) % BYTES_PER_POINT:
-        raise DatasetError(
-            f"{path} is no scan: {len(data)} bytes, need {BYTES_PER_POINT} for each point; {AGAIN}"
-        )
+    _check_size(path, len(data))
     points = np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3].astype(np.float64)
     if not (np.abs(points) < MAX_RANGE_M).all():
         raise DatasetError(
             f"{path} is no scan: points that are not finite or beyond {MAX_RANGE_M:g} m; {AGAIN}"
         )
     return points
+
+
+def _check_size(path: Path, num_bytes: int) -> None:
+    if not num_bytes or num_bytes % BYTES_PER_POINT:
+        raise DatasetError(
+            f"{path} is no scan: {num_bytes} bytes, need {BYTES_PER_POINT} for each point; {AGAIN}"
+        )
 
 
 def raise_beams(points: Array) -> Array:
@@ -207,7 +223,8 @@ def _is_behind_outline(depth: Depth, rig: Rig) -> NDArray[np.bool_]:
             break
         band = np.where((depth >= near_m) & (depth < far_m), depth, np.float32(np.inf))
         ends = np.rint(np.outer([1.0, -OUTLINE_MARGIN], parallax_px)).astype(int)
-        low, high = ends.min(axis=0) - [HIDING_SIDE_PX, 0], ends.max(axis=0) + [HIDING_SIDE_PX, 0]
+        aside = np.array([HIDING_SIDE_PX, 0])
+        low, high = ends.min(axis=0) - aside, ends.max(axis=0) + aside
         width, height = (high - low + 1).tolist()
         nearest = cv2.erode(
             band,

@@ -79,6 +79,7 @@ def make_reference(
         raise DatasetError(
             f"{next(iter(velodyne.paths.values()))} is the only scan, need 2 to find a motion"
         )
+    velodyne.check_files()
     if run is not None:
         refuse_other_input(run, dataset)  # before minutes of tracking
     folder = _new_folder(out, dataset.info.name)
