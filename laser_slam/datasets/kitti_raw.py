@@ -50,11 +50,11 @@ class KittiRaw(ListedSequence):
     again = AGAIN
 
     def __init__(
-        self, folder: Path, calibration: Path | None = None, camera: str | None = None
+        self, folder: Path, calibration: Path | str | None = None, camera: str | None = None
     ) -> None:
         images, paths = _find_images(folder, camera)
         camera = images.relative_to(folder).parts[0]
-        where = calibration or _find_calibration(folder)
+        where = Path(calibration) if calibration else _find_calibration(folder)
         size = check_same_kind(paths[:1], AGAIN).size
         self._rig = rig = raw_rig(where, camera, size, CALIBRATION_ADVICE)
         self._scans_folder = folder / "velodyne_points"
