@@ -1,5 +1,6 @@
 """Hours of runs: what is asked for first, who works where, and what is left when one is killed."""
 
+import fcntl
 import json
 import logging
 import os
@@ -242,6 +243,62 @@ def test_a_claim_is_for_one_and_leaves_nothing(tmp_path: Path) -> None:
     with claimed(folder):
         (folder / "kept").touch()
     assert (folder / "kept").exists()
+
+
+def test_where_folders_cannot_be_locked_claims_are_taken_for_granted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on Windows, which cannot open a folder either."""
+
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("laser_slam.benchmarks.claims.fcntl", None)
+    monkeypatch.setattr("laser_slam.benchmarks.claims.os.open", refuse)
+    with claimed(tmp_path / "run"), claimed(tmp_path / "run"):
+        assert (tmp_path / "run").is_dir()
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_that_its_last_user_removes_meanwhile_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before it is opened, and between that and the lock."""
+    folder, open_it, lock = tmp_path / "run", os.open, fcntl.flock
+
+    def open_removed(path: Path, flags: int) -> int:
+        folder.rmdir()
+        return open_it(path, flags)
+
+    def lock_removed(handle: int, how: int) -> None:
+        folder.rmdir()
+        lock(handle, how)
+
+    for place, late in (("os.open", open_removed), ("fcntl.flock", lock_removed)):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"laser_slam.benchmarks.claims.{place}", late)
+            with pytest.raises(TakenError, match="was at work"), claimed(folder):
+                pass
+        assert not folder.exists()
+
+
+def test_of_paths_in_reasons_the_whole_is_hidden_and_words_stay(tmp_path: Path) -> None:
+    bench = Bench(load_table("kitti"), Material(Path("data")), Path("r"), only=("03",))
+    (run,) = bench.runs([PLAIN])
+    found = run.without("r/ours/03 is no run: data/kitti and my-data/r.txt for data-sets")
+    assert found.reason == "RUNS/ours/03 is no run: DATA/kitti and my-data/r.txt for data-sets"
+    bench = Bench(load_table("kitti"), Material(None), tmp_path, only=("03",))
+    (run,) = bench.runs([PLAIN])
+    assert run.without(f"cannot use {tmp_path}: full").reason == "cannot use RUNS: full"
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    result = CliRunner().invoke(app, ["bench", "kitti", "--only", "05", "--quiet",
+                                      "--out", str(tmp_path / "file/out")])  # fmt: skip
+    assert result.exit_code == 1
+    assert "cannot use" in result.stderr
+    assert "choose another with --out" in result.stderr
 
 
 def test_a_lean_table_keeps_scores_and_no_windows(data: Path, tmp_path: Path) -> None:

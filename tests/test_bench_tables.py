@@ -30,7 +30,7 @@ TWO = """
     title: two of three
     groups: {all: [a, b, c]}
     rows: {ours: [], other: [windows.size=9]}
-    sequences: {a: {reader: images, note: of rooms}, b: {reader: images, note: x}, c: {reader: images}}
+    sequences: {a: {reader: synthetic, note: of rooms}, b: {reader: synthetic, note: x}, c: {reader: synthetic}}
     blocks:
       - title: errors
         columns:
@@ -144,7 +144,7 @@ def test_what_cannot_be_borrowed_says_so() -> None:
 
 
 def test_floats_that_are_no_published_numbers_are_numbers() -> None:
-    text = "{title: t, sequences: {a: {reader: r, arguments: {fps: 29.5}}}, blocks: []}"
+    text = "{title: t, sequences: {a: {reader: synthetic, arguments: {fps: 29.5}}}, blocks: []}"
     assert parse_table(text).sequences["a"].arguments["fps"] * 2 == 59
 
 
@@ -305,6 +305,8 @@ def test_a_page_gets_the_words_of_today_and_keeps_the_tables_of_others(tmp_path:
         ("{title: t, sequences: {}, blocks: [], colour: red}", "colour: Extra inputs"),
         (TWO.replace("over: a}", "over: z}"), "mine.yaml: no sequences z"),
         (TWO.replace("ate_m, over: a}", "ate, over: a}"), "no measure ate; there is ate_m"),
+        (TWO.replace("{reader: synthetic, note: x}", "{reader: tum-rgbd}"), "tum-rgbd needs 'at'"),
+        ("{title: t, borrowed: [kitti], sequences: {}, blocks: []}", "borrowed: wants a table's"),
     ],
 )
 def test_a_table_of_ones_own_that_is_wrong_says_where(

@@ -241,7 +241,7 @@ def test_a_sequence_may_have_a_line_of_its_own_for_each_row() -> None:
 def test_depth_of_videos_is_averaged_by_pixels() -> None:
     table = parse_table("""
         title: two videos
-        sequences: {a: {reader: images}, b: {reader: images}}
+        sequences: {a: {reader: synthetic}, b: {reader: synthetic}}
         groups: {both: [a, b]}
         blocks:
           - {title: t, columns: [{name: c, measure: bonn_abs_rel, over: both}]}

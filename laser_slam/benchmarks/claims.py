@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 
 from laser_slam.errors import RunFolderError
+from laser_slam.store.files import make_folder
 
 fcntl: ModuleType | None = None
 with suppress(ImportError):  # Windows has none: there, nobody is kept out
@@ -31,25 +32,34 @@ def claimed(folder: Path, *, to_read: bool = False) -> Iterator[None]:
         TakenError: another process is in it.
         RunFolderError: the folder cannot be made.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder, os.O_RDONLY)
-    except OSError as error:
-        raise RunFolderError(f"cannot use {folder}: {error.strerror}") from error
-    try:
-        _lock(handle, folder, to_read=to_read)
+    make_folder(folder)
+    with _locked(folder, to_read=to_read):
         try:
             yield
         finally:
             with suppress(OSError):  # it is not empty
                 folder.rmdir()
+
+
+@contextmanager
+def _locked(folder: Path, *, to_read: bool) -> Iterator[None]:
+    if fcntl is None:  # nor can a folder be opened there
+        yield
+        return
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except FileNotFoundError as error:  # who had it has just removed it as empty
+        raise TakenError(f"another process was at work in {folder}") from error
+    except OSError as error:
+        raise RunFolderError(f"cannot use {folder}: {error.strerror}") from error
+    try:
+        _lock(fcntl, handle, folder, to_read=to_read)
+        yield
     finally:
         os.close(handle)
 
 
-def _lock(handle: int, folder: Path, *, to_read: bool) -> None:
-    if fcntl is None:
-        return
+def _lock(fcntl: ModuleType, handle: int, folder: Path, *, to_read: bool) -> None:
     try:
         fcntl.flock(handle, (fcntl.LOCK_SH if to_read else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError as error:
@@ -57,5 +67,8 @@ def _lock(handle: int, folder: Path, *, to_read: bool) -> None:
     except OSError:  # a file system without locks
         return
     # Who had it may have removed it as empty since it was opened here.
-    if not folder.exists() or not os.path.samestat(os.fstat(handle), folder.stat()):
+    is_there = False
+    with suppress(FileNotFoundError):
+        is_there = os.path.samestat(os.fstat(handle), folder.stat())
+    if not is_there:
         raise TakenError(f"another process was at work in {folder}")

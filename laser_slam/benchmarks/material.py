@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from laser_slam.benchmarks.stretch import Stretch
-from laser_slam.benchmarks.table import SequenceSpec
+from laser_slam.benchmarks.table import GENERATED, SequenceSpec
 from laser_slam.config import Config, SyntheticConfig
 from laser_slam.datasets import DATASETS
 from laser_slam.datasets.base import Dataset
@@ -33,7 +33,7 @@ class Material:
         Raises:
             LaserSlamError: it is not there, there is no reader for it, or it cannot be read.
         """
-        if spec.reader == "synthetic":
+        if spec.reader == GENERATED:
             return _cut(_make(spec, config.synthetic), spec)
         places = self._find(spec)
         refusals: list[DatasetError] = []
@@ -53,8 +53,8 @@ class Material:
         What is generated is only looked for.
         """
         try:
-            if spec.reader in {ALONG_PATH, "synthetic"}:
-                is_there = spec.reader == "synthetic" or bool(self._find(spec))
+            if spec.reader in {ALONG_PATH, GENERATED}:
+                is_there = spec.reader == GENERATED or bool(self._find(spec))
                 return spec.num_frames or 0, None if is_there else _not_there(spec)
             return self.open(spec, config).info.num_frames or 0, None
         except LaserSlamError as error:

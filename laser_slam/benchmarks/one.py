@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import shutil
 from dataclasses import dataclass
 from functools import cached_property
@@ -125,7 +126,8 @@ class One:
         """Return an outcome without numbers; folders are named as anybody may."""
         for place, word in ((self.place.out, "RUNS"), (self.place.material.root, "DATA")):
             if place is not None and place != Path():
-                reason = reason.replace(str(place), word)
+                # The whole path only: with --out r, an r in a word is none.
+                reason = re.sub(rf"(?<![\w./-]){re.escape(str(place))}(?![\w-])", word, reason)
         return Outcome(*self.key, reason=reason, backbone=self.config.backbone.name)
 
     def _scores(

@@ -15,7 +15,7 @@ from laser_slam.benchmarks.settings import Setting
 from laser_slam.benchmarks.table import Table
 from laser_slam.benchmarks.written import as_csv, as_markdown
 from laser_slam.errors import RunFolderError
-from laser_slam.store import write_text
+from laser_slam.store.files import make_folder, write_text
 
 HEAD = """# Results as they stand
 
@@ -113,7 +113,7 @@ def save_table(out: Path, report: Report, page: Path | None = None) -> list[Path
     """
     grids = fill_grids(report.table, report.outcomes)
     section = report.section(grids)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     files = [out / f"{report.name}.md", out / f"{report.name}.csv"]
     write_text(files[0], section.rstrip() + "\n")
     write_text(files[1], as_csv(report.name, grids))
@@ -150,5 +150,5 @@ def put_on_page(page: Path, name: str, section: str) -> None:
         text = f"{text.rstrip()}\n\n{whole}\n"
     else:
         text = text[: found.start()] + whole + text[found.end() :]
-    page.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(page.parent)
     write_text(page, text)

@@ -20,6 +20,7 @@ from laser_slam.benchmarks.measures import MEASURES
 from laser_slam.errors import ConfigError
 
 FOLDER = Path(__file__).parent / "tables"
+GENERATED = "synthetic"  # the reader that needs no data
 
 
 class _Printed(float):
@@ -75,6 +76,12 @@ class SequenceSpec(_Part):
     num_frames: int | None = None
     settings: tuple[str, ...] = ()
     note: str = ""
+
+    @model_validator(mode="after")
+    def _lies_somewhere(self) -> Self:
+        if self.reader != GENERATED and not self.at:
+            raise ValueError(f"the reader {self.reader} needs 'at', the places where data may lie")
+        return self
 
 
 class Column(_Part):
@@ -163,6 +170,8 @@ class Table(_Part):
     def _borrow(cls, raw: Any) -> Any:
         if not isinstance(raw, dict) or not raw.get("borrowed"):
             return raw
+        if not isinstance(raw["borrowed"], dict):
+            raise ValueError("borrowed: wants a table's name and groups: {kitti: [all]}")
         sequences, groups = {}, {}
         for name, wanted in raw["borrowed"].items():
             other = load_table(name)

@@ -49,6 +49,20 @@ def flush(path: Path) -> None:
         os.fsync(file.fileno())
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it, unless it is there.
+
+    Raises:
+        RunFolderError: the system could not.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunFolderError(
+            f"cannot use {folder}: {error.strerror}; choose another with --out"
+        ) from error
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file, whole or not at all.
 
