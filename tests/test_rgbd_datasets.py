@@ -18,7 +18,7 @@ from laser_slam.cli import app
 from laser_slam.config import load_config
 from laser_slam.datasets import DATASETS
 from laser_slam.datasets.base import Dataset
-from laser_slam.datasets.bonn import MARKERS_FROM_CAM
+from laser_slam.datasets.bonn import MARKERS_FROM_CAM, Bonn
 from laser_slam.datasets.exr import read_exr
 from laser_slam.datasets.kitti_depth import KittiDepth
 from laser_slam.datasets.nrgbd import Nrgbd
@@ -299,6 +299,14 @@ def test_kitti_depth_uses_the_images_that_have_depth(root: Path) -> None:
     assert next(dataset.frames()).time_s == pytest.approx(FIRST_DEPTH / 10)
 
 
+def test_a_folder_that_is_no_drive_of_kitti_depth_is_told_so_before_its_images_are_missed(
+    tmp_path: Path,
+) -> None:
+    folder = write_layout("kitti-depth", tmp_path, NUM)
+    with pytest.raises(DatasetError, match=r"no depth maps in .*val/proj_depth.*; give a drive"):
+        KittiDepth(folder.parent)
+
+
 def test_kitti_depth_finds_the_raw_images_where_people_keep_them(tmp_path: Path) -> None:
     folder = write_layout("kitti-depth", tmp_path, NUM)
     day = tmp_path / "raw" / folder.name[:10]
@@ -355,6 +363,17 @@ def official(name: str, folder: Path) -> Path:
     path = folder / "depth.exr"
     path.write_bytes(zlib.decompress(base64.b85decode(OFFICIAL[name])))
     return path
+
+
+@pytest.mark.parametrize(("key", "reader"), [("bonn", TumRgbd), ("tum-rgbd", Bonn)])
+def test_a_sequence_of_bonn_is_none_of_tum_and_none_the_other_way(
+    key: str, reader: type[TumRgbd | Bonn], tmp_path: Path
+) -> None:
+    """They have the same files, but another camera and poses of another place on it."""
+    folder = write_layout(key, tmp_path, NUM)
+    with pytest.raises(DatasetError, match=f"by its name; read it with 'laser-slam {key}'"):
+        reader(folder)
+    assert reader(folder.rename(tmp_path / "mine")).info.num_frames == NUM
 
 
 @pytest.mark.parametrize("name", [name for name in OFFICIAL if name != "piz"])

@@ -14,7 +14,7 @@ from laser_slam.camera import intrinsics_matrix
 from laser_slam.datasets.decoding import read_depth
 from laser_slam.datasets.lens import Lens
 from laser_slam.datasets.listed import ListedSequence, Shot
-from laser_slam.datasets.timed_lists import AGAIN, read_shots, sequence_folder
+from laser_slam.datasets.timed_lists import AGAIN, read_shots, refuse_name, sequence_folder
 from laser_slam.datasets.tum_rgbd import SIZE, UNITS_PER_M
 from laser_slam.errors import DatasetError
 from laser_slam.sim3 import orthonormal
@@ -55,12 +55,14 @@ class Bonn(ListedSequence):
         rectify: take the lens distortion out, of images and depth.
 
     Raises:
-        DatasetError: no such sequence there, a list that is broken, or lists without common times.
+        DatasetError: no such sequence there, one of another data set by its name, a list that is
+            broken, or lists without common times.
     """
 
     again = AGAIN
 
     def __init__(self, folder: Path, *, by_rank: bool = False, rectify: bool = False) -> None:
+        refuse_name(folder, "rgbd_dataset_freiburg", "tum-rgbd")
         shots = [_of_camera(shot) for shot in read_shots(folder)]
         super().__init__(
             f"bonn-{sequence_folder(folder).resolve().name.removeprefix('rgbd_bonn_')}",

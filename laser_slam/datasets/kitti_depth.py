@@ -43,13 +43,8 @@ class KittiDepth(ListedSequence):
 
     def __init__(self, folder: Path, *, raw: Path | None = None) -> None:
         folder = folder.resolve()
-        depth_folder, images_folder = _find_folders(folder, raw)
-        depth = numbered_files(depth_folder, "", (".png",))
-        if not depth:
-            raise DatasetError(
-                f"no depth maps in {depth_folder}; give a drive such as "
-                "val/2011_09_26_drive_0002_sync"
-            )
+        depth = _list_depth(folder)
+        images_folder = _find_images(folder, raw)
         images = numbered_files(images_folder, "", (".png", ".jpg"))
         missing = [number for number in depth if number not in images]
         if missing:
@@ -66,17 +61,30 @@ class KittiDepth(ListedSequence):
         )
 
 
-def _find_folders(folder: Path, raw: Path | None) -> tuple[Path, Path]:
-    """Return the folders of the depth maps and of the images."""
+def _list_depth(folder: Path) -> dict[int, Path]:
+    """List the depth maps by their numbers, of which there must be some."""
     if folder.parent.name in GATHERED:
-        depth, images = (folder.parent.with_name(name) / folder.name for name in GATHERED)
-        return depth, images
+        found = folder.parent.with_name(GATHERED[0]) / folder.name
+    else:
+        found = folder / "proj_depth" / "groundtruth" / CAMERA
+    depth = numbered_files(found, "", (".png",))
+    if not depth:
+        raise DatasetError(
+            f"no depth maps in {found}; give a drive such as val/2011_09_26_drive_0002_sync"
+        )
+    return depth
+
+
+def _find_images(folder: Path, raw: Path | None) -> Path:
+    """Return the folder of the images."""
+    if folder.parent.name in GATHERED:
+        return folder.parent.with_name(GATHERED[1]) / folder.name
     drive, day = folder.name, folder.name[:10]
     above = [raw] if raw else [folder.parent, folder.parent.parent / "raw", folder.parent.parent]
     places = [place / part for place in above for part in (drive, f"{day}/{drive}")]
     for place in places:
         if (place / CAMERA / "data").is_dir():
-            return folder / "proj_depth" / "groundtruth" / CAMERA, place / CAMERA / "data"
+            return place / CAMERA / "data"
     raise DatasetError(
         f"no images of {drive} in {' or '.join(str(place) for place in above)}; pass --raw, the "
         f"folder that holds {day}/{drive}/{CAMERA}/data"

@@ -56,6 +56,20 @@ def read_shots(folder: Path) -> list[Shot]:
     ]
 
 
+def refuse_name(folder: Path, beginning: str, command: str) -> None:
+    """Refuse what is called as sequences of the same layout with another camera are.
+
+    Raises:
+        DatasetError: its name has this beginning.
+    """
+    name = sequence_folder(folder).resolve().name
+    if name.startswith(beginning):
+        raise DatasetError(
+            f"{name} has the camera and the poses of another data set by its name; "
+            f"read it with 'laser-slam {command}'"
+        )
+
+
 def sequence_folder(folder: Path) -> Path:
     """Return the folder of the whole sequence that a folder of chosen images lies in."""
     named = folder.resolve()

@@ -11,7 +11,7 @@ from laser_slam.camera import intrinsics_matrix
 from laser_slam.datasets.decoding import read_depth
 from laser_slam.datasets.lens import Lens
 from laser_slam.datasets.listed import ListedSequence
-from laser_slam.datasets.timed_lists import AGAIN, read_shots, sequence_folder
+from laser_slam.datasets.timed_lists import AGAIN, read_shots, refuse_name, sequence_folder
 
 UNITS_PER_M = 5000.0
 SIZE = (480, 640)
@@ -41,12 +41,14 @@ class TumRgbd(ListedSequence):
         rectify: take the lens distortion out, of images and depth.
 
     Raises:
-        DatasetError: no such sequence there, a list that is broken, or lists without common times.
+        DatasetError: no such sequence there, one of another data set by its name, a list that is
+            broken, or lists without common times.
     """
 
     again = AGAIN
 
     def __init__(self, folder: Path, *, posed_only: bool = False, rectify: bool = False) -> None:
+        refuse_name(folder, "rgbd_bonn_", "bonn")
         shots = read_shots(folder)
         name = sequence_folder(folder).resolve().name
         super().__init__(
