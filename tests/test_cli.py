@@ -334,3 +334,11 @@ def test_help_is_quick_and_loads_nothing_heavy() -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "Commands" in done.stdout
+
+
+@pytest.mark.parametrize("wrong", ["--only=3", "--set=windows.sise=9", "--backbone=nope"])
+def test_a_list_of_what_cannot_be_run_is_the_error_alone(wrong: str) -> None:
+    result = run("bench", "kitti", "--list", wrong)
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1

@@ -194,11 +194,12 @@ def _run(work: Bench, settings: Sequence[Setting], table: Path, options: BenchFl
 def _show_plan(work: Bench, settings: Sequence[Setting]) -> None:
     from laser_slam.benchmarks import list_groups, list_rows, list_sequences
 
+    sequences = list(list_sequences(work, settings))  # which refuses what is wrong
     typer.echo(f"{work.table.title}\n\n{work.table.about.strip()}\n")
     _print_pairs("Rows", list_rows(settings))
     _print_pairs("Groups of rows, for --setting", list_groups(work.table.row_groups))
     _print_pairs("Groups of sequences, for --only", list_groups(work.table.groups))
-    _print_pairs("Sequences", list_sequences(work, settings))
+    _print_pairs("Sequences", sequences)
 
 
 def _print_pairs(title: str, pairs: Iterable[tuple[str, str]]) -> None:

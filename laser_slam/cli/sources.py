@@ -82,7 +82,7 @@ def kitti(
 
 @functools.partial(source, name="7scenes")
 def seven_scenes(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Such as kitchen/seq-01.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Such as redkitchen/seq-03.")],
     options: RunOptions,
 ) -> None:
     """A sequence of 7-Scenes, scored against its poses and depth."""
