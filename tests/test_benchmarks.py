@@ -187,16 +187,6 @@ def test_the_command_names_every_table() -> None:
     assert all(name in told for name in table_names())
 
 
-@pytest.mark.parametrize("method", ["LASER (pi3)", "VGGT-Long", "pi3-Long"])
-def test_published_means_are_the_means_of_their_columns(method: str) -> None:
-    """A value that was copied wrongly would move the mean away from the published one."""
-    (row,) = (row for row in load_table("kitti").blocks[0].published if row.method == method)
-    values = [float(value) for value in row.values if value is not None]
-    assert len(values) == 13
-    assert sum(values[2:]) / 11 == pytest.approx(values[0], abs=0.006)
-    assert (sum(values[2:]) - values[3]) / 10 == pytest.approx(values[1], abs=0.006)
-
-
 @pytest.mark.parametrize("block", [0, 1, 2])
 def test_published_means_over_waymo_are_those_of_their_segments(block: int) -> None:
     for row in load_table("waymo").blocks[block].published:
@@ -238,21 +228,6 @@ def test_a_sequence_may_have_a_line_of_its_own_for_each_row() -> None:
     assert [row.name for row in fill_grids(table, outcomes[:1])[0].rows] == ["drive"]
 
 
-def test_depth_of_videos_is_averaged_by_pixels() -> None:
-    table = parse_table("""
-        title: two videos
-        sequences: {a: {reader: synthetic}, b: {reader: synthetic}}
-        groups: {both: [a, b]}
-        blocks:
-          - {title: t, columns: [{name: c, measure: bonn_abs_rel, over: both}]}
-        """)
-    outcomes = [
-        Outcome("ours", name, {"video_depth_bonn": {"abs_rel": error, "num_true_pixels": pixels}})
-        for name, error, pixels in (("a", 0.1, 3000), ("b", 0.5, 1000))
-    ]
-    assert fill_grids(table, outcomes)[0].rows[0].cells[0].value == pytest.approx(0.2)
-
-
 def test_markdown_and_csv_say_what_is_missing_and_escape_it() -> None:
     table = load_table("kitti")
     outcomes = [outcome("00", 2.0), outcome("01", None, "a | b,\nc")]
@@ -263,22 +238,6 @@ def test_markdown_and_csv_say_what_is_missing_and_escape_it() -> None:
                and one["method"] == "ours")  # fmt: skip
     assert (line["value"], line["num"], line["notes"]) == ("", "0", "01: a | b,\nc")
     assert "01: a | b,\nc" in write_notes(table, grids, outcomes)
-
-
-def test_what_breaks_a_run_is_a_reason_and_the_rest_goes_on(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise RuntimeError("CUDA out of memory")
-
-    monkeypatch.setattr("laser_slam.benchmarks.one.Pipeline", full)
-    work = Bench(load_table("kitti"), Material(data), tmp_path, only=("02", "03"))
-    found = work.run([Setting("ours")])
-    assert [(one.sequence, one.reason) for one in found][1] == (
-        "03",
-        "RuntimeError: CUDA out of memory",
-    )
-    assert found[0].reason is not None
 
 
 def test_without_data_the_reason_says_how_to_pass_it(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Camera poses are scored as evo does on the paper's terms, and a mean names what it lacks."""
 
 import os
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -9,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from test_evaluation import drifting, evo_pair, trajectory, winding_drive
 
-from laser_slam.benchmarks import Outcome, fill_grids, load_table
+from laser_slam.benchmarks import Cell, Outcome, fill_grids
+from laser_slam.benchmarks.table import parse_table
 from laser_slam.datasets.seven_scenes import SevenScenes
 from laser_slam.evaluation import (
-    SequenceScores,
     Statistics,
     TrajectoryErrors,
     VideoDepthErrors,
@@ -20,8 +21,6 @@ from laser_slam.evaluation import (
     align,
     evaluate_trajectory,
     evaluate_video_depth,
-    failed_sequence,
-    mean_score,
     relative_errors,
 )
 from laser_slam.types import Trajectory
@@ -139,59 +138,23 @@ def test_a_sequence_that_was_lost_halfway_says_so() -> None:
 # --- means ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "method",
-    ["LASER (pi3)", "pi3-Long", "VGGT-Long", "ORB-SLAM2 (w/ LC)", "ORB-SLAM2 (w/o LC)", "LDSO"],
-)
-def test_the_papers_averages_follow_from_its_sequences(method: str) -> None:
-    """What a table makes of the published errors of 00 to 10 is what the paper prints as means."""
-    table = load_table("kitti")
-    (row,) = (row for row in table.blocks[0].published if row.method == method)
-    every, star, *ates = (None if value is None else float(value) for value in row.values)
+def video_cells(*videos: VideoDepthErrors) -> tuple[Cell, ...]:
+    """Return the means of Abs Rel and delta that a table makes of videos."""
+    table = parse_table("""
+        title: videos
+        sequences: {a: {reader: synthetic}, b: {reader: synthetic}}
+        groups: {all: [a, b]}
+        blocks:
+          - title: t
+            columns:
+              - {name: c, measure: bonn_abs_rel, over: all}
+              - {name: d, measure: bonn_delta_percent, over: all}
+        """)
     outcomes = [
-        Outcome("ours", name, {"run": {"trajectory": {"ate_sim3_m": {"rmse": ate}}}})
-        for name, ate in zip(table.sequences, ates, strict=True)
+        Outcome("ours", name, {"video_depth_bonn": asdict(errors)})
+        for name, errors in zip(table.sequences, videos, strict=True)
     ]
-    cells = fill_grids(table, outcomes)[0].rows[0].cells[:2]
-    assert [cell.value for cell in cells] == pytest.approx([every, star], abs=0.0101)
-    assert [(cell.num, cell.num_wanted) for cell in cells] == [(11, 11), (10, 10)]
-
-
-def test_the_published_chamfer_distance_is_the_mean_of_both_ways() -> None:
-    """And so is each sequence's: half of the sum, as here, and not the sum."""
-    acc, comp, chamfer = (block.published for block in load_table("waymo").blocks[:3])
-    assert [row.method for row in acc] == [row.method for row in chamfer]
-    for rows in zip(acc, comp, chamfer, strict=True):
-        there, back, both = (np.array(row.values, float) for row in rows)
-        np.testing.assert_allclose((there + back) / 2, both, atol=0.00101)
-
-
-def test_a_failed_sequence_counts_for_no_mean_and_is_named() -> None:
-    rows = [SequenceScores("00", {"ate_m": 6.0}), failed_sequence("01", "tracking lost")]
-    mean = mean_score(rows, "ate_m")
-    assert (mean.value, mean.num, mean.num_sequences) == (6.0, 1, 2)
-    assert mean.missing == ("01",)
-    assert rows[1].reason == "tracking lost"
-
-
-def test_a_mean_of_nothing_is_none() -> None:
-    for rows in ([], [failed_sequence("a", "no images")], [SequenceScores("a", {"ate_m": None})]):
-        mean = mean_score(rows, "ate_m")
-        assert (mean.value, mean.num) == (None, 0)
-        assert mean.num_sequences == len(rows)
-
-
-def test_the_order_of_rows_does_not_matter() -> None:
-    rows = [SequenceScores(str(i), {"ate_m": float(i**2)}, weight=i + 1.0) for i in range(7)]
-    for is_weighted in (False, True):
-        there = mean_score(rows, "ate_m", is_weighted=is_weighted)
-        back = mean_score(rows[::-1], "ate_m", is_weighted=is_weighted)
-        assert there.value == pytest.approx(back.value)
-
-
-def video_row(name: str, errors: VideoDepthErrors) -> SequenceScores:
-    scores = {"abs_rel": errors.abs_rel, "delta_125": errors.delta_125}
-    return SequenceScores(name, scores, errors.num_true_pixels)
+    return fill_grids(table, outcomes)[0].rows[0].cells
 
 
 def test_a_weighted_mean_of_videos_is_that_of_all_their_pixels() -> None:
@@ -201,15 +164,13 @@ def test_a_weighted_mean_of_videos_is_that_of_all_their_pixels() -> None:
         truth = rng.uniform(1, 50, size).astype(np.float32)
         videos.append((truth * rng.uniform(0.6, 1.5, size).astype(np.float32), truth))
     protocol = VideoDepthProtocol()
-    rows = [
-        video_row(str(i), evaluate_video_depth(partial(list, [pair]), protocol, "metric"))
-        for i, pair in enumerate(videos)
-    ]
+    each = [evaluate_video_depth(partial(list, [pair]), protocol, "metric") for pair in videos]
     pooled = evaluate_video_depth(lambda: videos, protocol, "metric")
-    for name, value in (("abs_rel", pooled.abs_rel), ("delta_125", pooled.delta_125)):
-        weighted = mean_score(rows, name, is_weighted=True)
-        assert weighted.value == pytest.approx(value, abs=1e-12)
-        assert mean_score(rows, name).value != pytest.approx(value, abs=1e-3)
+    assert pooled.abs_rel is not None
+    assert pooled.delta_125 is not None
+    abs_rel, delta = (cell.value for cell in video_cells(*each))
+    assert abs_rel == pytest.approx(pooled.abs_rel, abs=1e-12)
+    assert delta == pytest.approx(100 * pooled.delta_125, abs=1e-10)
 
 
 def test_a_video_of_which_little_is_predicted_weighs_as_much_as_predicted_whole() -> None:
@@ -219,24 +180,22 @@ def test_a_video_of_which_little_is_predicted_weighs_as_much_as_predicted_whole(
     little[0] = 1.3
     protocol = VideoDepthProtocol()
     for hard in (np.full((10, 10), 1.3, np.float32), little):
-        videos = {"easy": truth, "hard": hard}
-        rows = [
-            video_row(
-                name, evaluate_video_depth(partial(list, [(depth, truth)]), protocol, "metric")
-            )
-            for name, depth in videos.items()
+        each = [
+            evaluate_video_depth(partial(list, [(depth, truth)]), protocol, "metric")
+            for depth in (truth, hard)
         ]
-        mean = mean_score(rows, "abs_rel", is_weighted=True)
-        assert mean.value == pytest.approx(0.15, abs=1e-6)
-        assert (mean.num, mean.missing) == (2, ())
+        abs_rel, _ = video_cells(*each)
+        assert abs_rel.value == pytest.approx(0.15, abs=1e-6)
+        assert abs_rel.num == 2
 
 
 def test_a_video_without_depth_is_in_no_mean_and_is_named() -> None:
     truth = np.ones((4, 4), dtype=np.float32)
     good = evaluate_video_depth(lambda: [(truth, truth)], VideoDepthProtocol())
     blind = evaluate_video_depth(lambda: [(None, truth)], VideoDepthProtocol())
-    rows = [video_row("good", good), video_row("blind", blind)]
-    mean = mean_score(rows, "abs_rel", is_weighted=True)
-    assert mean.value == pytest.approx(0, abs=1e-9)
-    assert mean.missing == ("blind",)
-    assert blind.reason == "no pixel has both depth and truth"
+    abs_rel, _ = video_cells(good, blind)
+    assert abs_rel.value == pytest.approx(0, abs=1e-9)
+    assert (abs_rel.num, abs_rel.num_wanted) == (1, 2)
+    assert abs_rel.reasons == {"b": "no pixel has both depth and truth"}
+    nothing, _ = video_cells(blind, blind)
+    assert (nothing.value, nothing.num, nothing.text) == (None, 0, "-")

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from operator import mul
 
 from laser_slam.benchmarks.measures import (
     MEASURES,
+    Better,
     Measure,
     Scores,
     look_up,
@@ -15,20 +17,9 @@ from laser_slam.benchmarks.measures import (
 )
 from laser_slam.benchmarks.outcome import Outcome
 from laser_slam.benchmarks.table import Block, Column, Table
-from laser_slam.evaluation import SequenceScores, failed_sequence, mean_score
 
 NOT_ASKED = "not asked for"
 PART = "only a part is there: "
-# These say what a run is, not how good it is.
-NO_SCORES = {
-    "frames",
-    "path_m",
-    "candidates",
-    "loops",
-    "bridged",
-    "frames_per_s",
-    "coverage_percent",
-}
 
 
 @dataclass(frozen=True)
@@ -119,20 +110,18 @@ class Grid:
     def heading(self) -> str:
         """Return the title, and which numbers are better where that is one for all columns."""
         words = {_better(column) for column in self.columns}
-        word = words.pop() if len(words) == 1 else ""
+        word = words.pop() if len(words) == 1 else None
         return f"{self.title}; {word} is better" if word else self.title
 
     def header(self, column: Column) -> str:
         """Return a column's name, and which numbers are better where that differs."""
         if len({_better(other) for other in self.columns}) == 1:
             return column.name
-        return column.name + {"lower": " ↓", "higher": " ↑", "": ""}[_better(column)]
+        return column.name + {"lower": " ↓", "higher": " ↑", None: ""}[_better(column)]
 
 
-def _better(column: Column) -> str:
-    if column.measure in NO_SCORES or column.measure.endswith("_pixels_percent"):
-        return ""
-    return "higher" if MEASURES[column.measure].is_higher_better else "lower"
+def _better(column: Column) -> Better | None:
+    return MEASURES[column.measure].better
 
 
 def fill_grids(table: Table, outcomes: Sequence[Outcome]) -> list[Grid]:
@@ -210,21 +199,20 @@ class _Found:
 
 def _cell(column: Column, members: Sequence[str], outcomes: Sequence[Outcome | None]) -> Cell:
     measure = MEASURES[column.measure]
-    rows, reasons, parts = [], {}, {}
+    values, weights, reasons, parts = [], [], {}, {}
     for name, outcome in zip(members, outcomes, strict=True):
         scores: Scores = {} if outcome is None else outcome.scores
         value = look_up(scores, measure)
         part = None if outcome is None else outcome.part
         if value is None or (part is not None and len(members) > 1):
             reasons[name] = _why(outcome, measure)
-            rows.append(failed_sequence(name, reasons[name]))
-        else:
-            found = {column.measure: value * measure.factor}
-            rows.append(SequenceScores(name, found, weight(scores, measure)))
-            if part is not None:
-                parts[name] = part
-    mean = mean_score(rows, column.measure, is_weighted=True)
-    return Cell(mean.value, mean.num, mean.num_sequences, measure.digits, reasons, parts)
+            continue
+        values.append(value * measure.factor)
+        weights.append(weight(scores, measure))
+        if part is not None:
+            parts[name] = part
+    mean = sum(map(mul, weights, values)) / sum(weights) if values else None
+    return Cell(mean, len(values), len(members), measure.digits, reasons, parts)
 
 
 def _why(outcome: Outcome | None, measure: Measure) -> str:

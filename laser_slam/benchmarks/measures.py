@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 Scores = Mapping[str, Any]
+Better = Literal["lower", "higher"]
 
 PROTOCOL_VERSION = 2  # rises when a protocol's numbers change, so that kept ones are not taken
 POINTS = ("indoor", "7scenes", "nrgbd", "outdoor", "waymo")  # protocols of point maps
@@ -22,14 +23,14 @@ class Measure:
         path: where it stands in the result of the protocol, as ``a.b.c``.
         digits: after the point.
         factor: that it is written with, such as 100 for percent.
-        is_higher_better: else a lower one is.
+        better: which numbers are; None: it says what a run is, not how good it is.
     """
 
     protocol: str
     path: str
     digits: int = 3
     factor: float = 1.0
-    is_higher_better: bool = False
+    better: Better | None = "lower"
 
 
 MEASURES = {
@@ -39,38 +40,35 @@ MEASURES = {
     "rpe_rotation_deg": Measure("run", "trajectory.rpe_rotation_deg.rmse"),
     "t_rel_percent": Measure("run", "trajectory.kitti.t_rel_percent", 2),
     "r_rel_deg_per_100m": Measure("run", "trajectory.kitti.r_rel_deg_per_100m"),
-    "path_m": Measure("run", "trajectory.path_length_m", 0, 1.0, True),
+    "path_m": Measure("run", "trajectory.path_length_m", 0, better=None),
     "sampled_abs_rel": Measure("run", "depth.by_median_ratio.abs_rel"),
-    "sampled_delta_percent": Measure("run", "depth.by_median_ratio.delta_125", 1, 100.0, True),
-    "coverage_percent": Measure("run", "depth.by_median_ratio.coverage", 0, 100.0, True),
-    "loops": Measure("run", "closures.accepted", 0, 1.0, True),
-    "candidates": Measure("run", "closures.candidates", 0, 1.0, True),
-    "frames": Measure("run", "frames.read", 0, 1.0, True),
-    "bridged": Measure("run", "windows.num_bridged", 0),
-    "frames_per_s": Measure("run", "frames_per_second", 2, 1.0, True),
+    "sampled_delta_percent": Measure("run", "depth.by_median_ratio.delta_125", 1, 100.0, "higher"),
+    "coverage_percent": Measure("run", "depth.by_median_ratio.coverage", 0, 100.0, None),
+    "loops": Measure("run", "closures.accepted", 0, better=None),
+    "candidates": Measure("run", "closures.candidates", 0, better=None),
+    "frames": Measure("run", "frames.read", 0, better=None),
+    "bridged": Measure("run", "windows.num_bridged", 0, better=None),
+    "frames_per_s": Measure("run", "frames_per_second", 2, better=None),
     **{
-        f"{name}_{measure}": Measure(f"video_depth_{name}", path, digits, factor, is_higher_better)
+        f"{name}_{measure}": Measure(f"video_depth_{name}", *rest)
         for name in ("sintel", "bonn", "kitti")
-        for measure, path, digits, factor, is_higher_better in (
-            ("abs_rel", "abs_rel", 3, 1.0, False),
-            ("delta_percent", "delta_125", 1, 100.0, True),
-            ("pixels_percent", "coverage", 1, 100.0, True),
+        for measure, *rest in (
+            ("abs_rel", "abs_rel"),
+            ("delta_percent", "delta_125", 1, 100.0, "higher"),
+            ("pixels_percent", "coverage", 1, 100.0, None),
         )
     },
     **{
-        f"{name}_pixels_percent": Measure(f"points_{name}", "coverage", 1, 100.0, True)
+        f"{name}_{measure}": Measure(f"points_{name}", *rest)
         for name in POINTS
-    },
-    **{
-        f"{name}_{measure}": Measure(f"points_{name}", path, 3, 1.0, path.startswith("nc"))
-        for name in POINTS
-        for measure, path in (
+        for measure, *rest in (
+            ("pixels_percent", "coverage", 1, 100.0, None),
             ("acc_m", "acc_mean_m"),
             ("acc_median_m", "acc_median_m"),
             ("comp_m", "comp_mean_m"),
             ("comp_median_m", "comp_median_m"),
-            ("nc", "nc_mean"),
-            ("nc_median", "nc_median"),
+            ("nc", "nc_mean", 3, 1.0, "higher"),
+            ("nc_median", "nc_median", 3, 1.0, "higher"),
             ("chamfer_m", "chamfer_m"),
         )
     },

@@ -85,7 +85,7 @@ class SequenceSpec(_Part):
 
 
 class Column(_Part):
-    """One column: the mean of a measure over some sequences, each of which counts the same.
+    """One column: the mean of a measure over some sequences, as ``measures.weight`` weighs them.
 
     Attributes:
         measure: name in ``laser_slam.benchmarks.measures.MEASURES``.

@@ -1,12 +1,6 @@
 """Metrics: numbers in, numbers out; no files, no plots."""
 
 from laser_slam.evaluation.depth import DepthErrors, evaluate_depth
-from laser_slam.evaluation.means import (
-    Mean,
-    SequenceScores,
-    failed_sequence,
-    mean_score,
-)
 from laser_slam.evaluation.points import (
     INDOOR_POINTS,
     OUTDOOR_POINTS,
@@ -40,11 +34,9 @@ __all__ = [
     "VIDEO_DEPTH_PROTOCOLS",
     "DepthErrors",
     "KittiErrors",
-    "Mean",
     "PointErrors",
     "PointMap",
     "PointProtocol",
-    "SequenceScores",
     "Statistics",
     "TrajectoryErrors",
     "VideoDepthErrors",
@@ -56,9 +48,7 @@ __all__ = [
     "evaluate_points",
     "evaluate_trajectory",
     "evaluate_video_depth",
-    "failed_sequence",
     "kitti_errors",
-    "mean_score",
     "relative_errors",
     "resize_depth",
 ]
