@@ -475,6 +475,8 @@ def test_faults_of_sam2_are_told_in_one_line(
     weights = tmp_path / "weights.pt"
     with pytest.raises(ConfigError, match=r"sam2_checkpoint: no file '.*weights.pt'; get the"):
         make_segmenter(SegmentationConfig(segmenter="sam2", sam2_checkpoint=str(weights)))
+    with pytest.raises(ConfigError, match=r"sam2_checkpoint: not set; get the"):
+        make_segmenter(SegmentationConfig(segmenter="sam2"))
     weights.touch()
     config = {"segmenter": "sam2", "sam2_checkpoint": str(weights)}
     monkeypatch.setitem(sys.modules, "sam2", None)

@@ -60,8 +60,9 @@ def stack_masks(masks: list[NDArray[np.bool_]], size: tuple[int, int]) -> NDArra
 
 def _load(model_config: str, checkpoint: str) -> Any:
     if not checkpoint or not Path(checkpoint).expanduser().is_file():
+        given = f"no file '{checkpoint}'" if checkpoint else "not set"
         raise ConfigError(
-            f"layers.segmentation.sam2_checkpoint: no file '{checkpoint}'; get the weights from "
+            f"layers.segmentation.sam2_checkpoint: {given}; get the weights from "
             "https://github.com/facebookresearch/sam2 and give their path"
         )
     try:
