@@ -77,7 +77,7 @@ def test_what_cannot_be_had_is_found_out_before_the_first_run_and_once(
         return Pipeline(*arguments, **more)
 
     monkeypatch.setattr("laser_slam.benchmarks.readiness.make_backbone", no_weights)
-    monkeypatch.setattr("laser_slam.benchmarks.one.Pipeline", noted)
+    monkeypatch.setattr("laser_slam.benchmarks.row_run.Pipeline", noted)
     other = Setting("network, no layers", (*NETWORK.assignments, "layers.enabled=never"))
     with caplog.at_level(logging.WARNING):
         found = work(data, tmp_path).run([PLAIN, NETWORK, other])
@@ -103,7 +103,7 @@ def test_a_network_is_made_once_for_all_runs(
         raise RuntimeError("CUDA out of memory")
 
     monkeypatch.setattr("laser_slam.benchmarks.readiness.make_backbone", make)
-    monkeypatch.setattr("laser_slam.benchmarks.one.Pipeline", broken)
+    monkeypatch.setattr("laser_slam.benchmarks.row_run.Pipeline", broken)
     found = work(data, tmp_path).run([NETWORK, Setting("other", NETWORK.assignments)])
     assert len(made) == 1
     assert used == made * 4
@@ -118,7 +118,7 @@ def test_a_bug_in_one_run_is_its_reason_with_a_traceback_and_the_others_go_on(
             raise TypeError("no such thing")
         return Pipeline(dataset, *arguments, **more)
 
-    monkeypatch.setattr("laser_slam.benchmarks.one.Pipeline", broken)
+    monkeypatch.setattr("laser_slam.benchmarks.row_run.Pipeline", broken)
     found = work(data, tmp_path).run([PLAIN])
     assert [one.reason for one in found] == ["TypeError: no such thing", None]
     assert "Traceback" in caplog.text
@@ -442,7 +442,7 @@ def test_an_interrupted_table_says_how_to_go_on(
             raise KeyboardInterrupt
         return Pipeline(dataset, *arguments, **more)
 
-    monkeypatch.setattr("laser_slam.benchmarks.one.Pipeline", interrupted)
+    monkeypatch.setattr("laser_slam.benchmarks.row_run.Pipeline", interrupted)
     result = run_command(data, tmp_path)
     assert result.exit_code == 130
     assert f"interrupted; 2 of 4 runs are finished in {tmp_path}; the same command" in result.stderr

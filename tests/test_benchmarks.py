@@ -377,7 +377,7 @@ def test_scores_that_are_kept_are_not_worked_out_again(
     work = Bench(parse_table(SCORED), Material(data), tmp_path)
     rows = [Setting("exact", (*SIMULATED, *EXACT))]
     first = work.run(rows)
-    monkeypatch.setattr("laser_slam.benchmarks.one.PROTOCOLS", {})
+    monkeypatch.setattr("laser_slam.benchmarks.row_run.PROTOCOLS", {})
     assert work.run(rows) == first
     (tmp_path / "exact" / "03" / "bench.json").write_text("{")
     assert "it will be worked out anew" in str(work.run(rows)[0].reason)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence, Sized
 
 from laser_slam.benchmarks.notes import name_groups
-from laser_slam.benchmarks.one import One
+from laser_slam.benchmarks.row_run import RowRun
 from laser_slam.benchmarks.runner import Bench
 from laser_slam.benchmarks.settings import Setting
 from laser_slam.benchmarks.table import load_table, table_names
@@ -42,7 +42,7 @@ def list_sequences(bench: Bench, settings: Sequence[Setting]) -> Iterator[tuple[
         yield ", ".join(name_groups(names, bench.table.groups)), state
 
 
-def _state(runs: Sequence[One]) -> str:
+def _state(runs: Sequence[RowRun]) -> str:
     num, spec = sum(run.is_finished for run in runs), runs[0].spec
     if num == len(runs):
         return "finished"

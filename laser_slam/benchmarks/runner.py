@@ -14,10 +14,10 @@ from pathlib import Path
 from laser_slam.benchmarks.claims import TakenError, claimed
 from laser_slam.benchmarks.material import LastOpened, Material
 from laser_slam.benchmarks.notes import name_groups
-from laser_slam.benchmarks.one import One, Place
 from laser_slam.benchmarks.outcome import NOT_YET, Outcome
 from laser_slam.benchmarks.pace import Pace, in_words
 from laser_slam.benchmarks.readiness import Readiness, refuse_unknown_names
+from laser_slam.benchmarks.row_run import Place, RowRun
 from laser_slam.benchmarks.settings import Setting
 from laser_slam.benchmarks.table import Table
 from laser_slam.bookkeeping import Progress, no_progress
@@ -82,7 +82,7 @@ class Bench:
         wanted = {name for group in self.only for name in groups[group]}
         return [name for name in self.table.sequences if name in wanted or not self.only]
 
-    def runs(self, settings: Sequence[Setting]) -> list[One]:
+    def runs(self, settings: Sequence[Setting]) -> list[RowRun]:
         """Return all runs in their order: all rows on the first sequence, then the next.
 
         Raises:
@@ -90,7 +90,7 @@ class Bench:
         """
         place = Place(self.table, self.material, self.out, self.is_shared, self.is_lean)
         runs = [
-            One(place, setting, name, self._config(setting, name))
+            RowRun(place, setting, name, self._config(setting, name))
             for name in self.sequences()
             for setting in settings
         ]
@@ -147,13 +147,13 @@ class Bench:
 class _Work:
     """Runs, what became of them, and how long the rest will take."""
 
-    def __init__(self, runs: list[One]) -> None:
+    def __init__(self, runs: list[RowRun]) -> None:
         self.runs = runs
         self.done: dict[tuple[str, str], Outcome] = {}
         self._readiness, self._opened = Readiness(), LastOpened()
         self._absent: dict[str, str] = {}
         frames: dict[str, int] = {}
-        self._to_do: dict[tuple[str, str], One] = {}
+        self._to_do: dict[tuple[str, str], RowRun] = {}
         for run in (run for run in runs if not run.is_finished):
             if run.name not in {*frames, *self._absent}:
                 num, reason = run.place.material.look(run.spec, run.config)
@@ -179,12 +179,12 @@ class _Work:
             logger.warning("%s: %s", ", ".join(name_groups(names, groups)), reason)
         self._readiness.check(run.config for run in self._to_do.values())
 
-    def left(self) -> list[One]:
+    def left(self) -> list[RowRun]:
         """Return what has not been looked at, finished runs first: then every table has them."""
         left = [run for run in self.runs if run.key not in self.done]
         return sorted(left, key=lambda run: not run.is_finished)
 
-    def do(self, run: One, on_progress: Progress, *, is_last: bool) -> bool:
+    def do(self, run: RowRun, on_progress: Progress, *, is_last: bool) -> bool:
         """Have a run's outcome, unless another process is at it; tell whether it is a new one."""
         is_new, reason = run.key in self._to_do and not run.is_finished, None
         if not run.is_finished:

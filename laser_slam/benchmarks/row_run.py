@@ -61,7 +61,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class One:
+class RowRun:
     """One row on one sequence."""
 
     place: Place
