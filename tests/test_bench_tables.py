@@ -21,7 +21,7 @@ from laser_slam.benchmarks import (
     print_grids,
     table_names,
 )
-from laser_slam.benchmarks.notes import write_notes
+from laser_slam.benchmarks.notes import name_groups, write_notes
 from laser_slam.benchmarks.page import Report, put_on_page
 from laser_slam.benchmarks.table import FOLDER, Table, parse_table
 from laser_slam.errors import ConfigError
@@ -255,6 +255,38 @@ def test_notes_name_groups_and_leave_out_rows_where_all_are_meant() -> None:
     some = [Outcome("b", "00", reason="no weights"), ate("00", 1.0), ate("00", 2.0, "c")]
     assert write_notes(table, [], some) == ["00 (b): no weights"]
     assert write_notes(table, [], [ate("00", 1.0)]) == []
+
+
+def test_notes_name_large_groups_that_lack_a_few() -> None:
+    table = load_table("pose")
+    sequences = list(table.sequences)
+    asked = "scannet-scene0707_00"
+    others = [name for name in sequences if name != asked]
+    text = f"sintel (14), tum (8), scannet (99 of 100, not {asked})"
+    assert ", ".join(name_groups(others, table.groups)) == text
+    few = load_table("kitti")
+    assert name_groups(list(few.sequences)[1:], few.groups) == list(few.sequences)[1:]
+
+
+def test_the_csv_has_each_sequence_of_a_mean_also_where_only_a_part_is_there() -> None:
+    table = parse_table(TWO)
+    outcomes = [ate("a", 1.0), ate("c", 4.0, part="3 of 9 frames")]
+    grids = fill_grids(table, outcomes)
+    lines = [
+        line
+        for line in csv.DictReader(io.StringIO(as_csv("t", grids)))
+        if line["source"] == "this run"
+    ]
+    told = [(line["over"], line["value"], line["notes"]) for line in lines]
+    assert told[0][:2] == ("all", "1.0")  # of which a is, which has a column for itself
+    assert told[1] == ("c", "4.0", "only a part is there: 3 of 9 frames")
+    assert [over for over, _, _ in told] == ["all", "c", "a"]
+    text = "c: only a part is there: 3 of 9 frames; in no mean, its numbers are in the CSV"
+    assert text in write_notes(table, grids, outcomes)
+    marked = [ate("a", 1.0, part="3 of 9 frames")]
+    assert "a: *: only a part is there: 3 of 9 frames" in write_notes(
+        table, fill_grids(table, marked), marked
+    )
 
 
 def test_notes_say_what_numbers_are_not_over() -> None:

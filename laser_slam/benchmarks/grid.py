@@ -33,6 +33,7 @@ class Cell:
         digits: after the point.
         reasons: why sequences are not in it, by name.
         parts: which part of a sequence is in it, by name; of all others it is the whole.
+        each: the numbers of the sequences that have one, by name, whether they are in it or not.
         is_best: no complete number of the column is better.
     """
 
@@ -42,6 +43,7 @@ class Cell:
     digits: int = 2
     reasons: dict[str, str] = field(default_factory=dict)
     parts: dict[str, str] = field(default_factory=dict)
+    each: dict[str, float] = field(default_factory=dict)
     is_best: bool = False
 
     @property
@@ -199,20 +201,22 @@ class _Found:
 
 def _cell(column: Column, members: Sequence[str], outcomes: Sequence[Outcome | None]) -> Cell:
     measure = MEASURES[column.measure]
-    values, weights, reasons, parts = [], [], {}, {}
+    values, weights, reasons, parts, each = [], [], {}, {}, {}
     for name, outcome in zip(members, outcomes, strict=True):
         scores: Scores = {} if outcome is None else outcome.scores
         value = look_up(scores, measure)
         part = None if outcome is None else outcome.part
+        if value is not None:
+            each[name] = value * measure.factor
         if value is None or (part is not None and len(members) > 1):
             reasons[name] = _why(outcome, measure)
             continue
-        values.append(value * measure.factor)
+        values.append(each[name])
         weights.append(weight(scores, measure))
         if part is not None:
             parts[name] = part
     mean = sum(map(mul, weights, values)) / sum(weights) if values else None
-    return Cell(mean, len(values), len(members), measure.digits, reasons, parts)
+    return Cell(mean, len(values), len(members), measure.digits, reasons, parts, each)
 
 
 def _why(outcome: Outcome | None, measure: Measure) -> str:

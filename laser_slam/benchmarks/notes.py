@@ -10,6 +10,8 @@ from laser_slam.benchmarks.measures import remarks
 from laser_slam.benchmarks.outcome import Outcome
 from laser_slam.benchmarks.table import Table
 
+MOST_LISTED = 10  # members of a group that lacks some: one by one
+
 
 @dataclass(frozen=True)
 class Note:
@@ -35,9 +37,10 @@ class Note:
 def write_notes(table: Table, grids: Sequence[Grid], outcomes: Sequence[Outcome]) -> list[str]:
     """Return lines on what has no number and what is to know of numbers, each thing once."""
     rows = list(dict.fromkeys(outcome.setting for outcome in outcomes))
+    marked = {name for _, _, cell in _cells(grids) for name in cell.parts}
     notes = [
         *_join((one.reason, one.sequence, one.setting) for one in outcomes if one.reason),
-        *_join((f"*: {PART}{one.part}", one.sequence, "") for one in outcomes if one.part),
+        *_join((_of_part(one, marked), one.sequence, "") for one in outcomes if one.part),
         *_join(
             (remark, one.sequence, one.setting)
             for one in outcomes
@@ -47,6 +50,13 @@ def write_notes(table: Table, grids: Sequence[Grid], outcomes: Sequence[Outcome]
         *_by_measure(grids, {(one.setting, one.sequence) for one in outcomes if one.reason}),
     ]
     return [_shorten(note, rows).line(table.groups) for note in notes]
+
+
+def _of_part(one: Outcome, marked: Collection[str]) -> str:
+    """Say of which part the numbers of a sequence are, and where they stand if it is in no cell."""
+    text = f"{PART}{one.part}"
+    is_unseen = one.scores and one.sequence not in marked
+    return f"{text}; in no mean, its numbers are in the CSV" if is_unseen else f"*: {text}"
 
 
 def _join(found: Iterable[tuple[str, str, str]]) -> Iterator[Note]:
@@ -91,10 +101,15 @@ def _shorten(note: Note, rows: Sequence[str]) -> Note:
 
 
 def name_groups(sequences: Sequence[str], groups: Mapping[str, Sequence[str]]) -> list[str]:
-    """Name whole groups instead of their members, the largest first."""
+    """Name groups instead of their members: whole ones, then large ones that lack a few."""
     left, named = list(sequences), []
-    for name, members in sorted(groups.items(), key=lambda item: -len(item[1])):
-        if len(members) > 1 and set(members) <= set(left):
-            named.append(f"{name} ({len(members)})")
-            left = [sequence for sequence in left if sequence not in members]
+    sizes = sorted(groups.items(), key=lambda item: -len(item[1]))
+    for is_whole in (True, False):
+        for name, members in sizes:
+            absent = [member for member in members if member not in left]
+            num = len(members) - len(absent)
+            if num > 1 and (not absent if is_whole else num > MOST_LISTED > len(absent)):
+                but = f" of {len(members)}, not {', '.join(absent)}" if absent else ""
+                named.append(f"{name} ({num}{but})")
+                left = [sequence for sequence in left if sequence not in members]
     return named + left

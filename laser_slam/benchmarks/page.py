@@ -42,7 +42,7 @@ loops. `--lean` keeps scores, paths and report of each run, and neither windows 
 Rows in bold were run by the command, with the backbone in brackets; all others are as the source
 with that number has published them. The best number of a column is bold. A mean says over how many
 sequences it is where some have no number; a number with * is over a part of a sequence, and in no
-mean. The notes say why.
+mean. The notes say why. The CSV file in `--out` has every number, also of each sequence of a mean.
 """
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from laser_slam.benchmarks.grid import Cell, Grid
 from laser_slam.benchmarks.notes import write_notes
 from laser_slam.benchmarks.outcome import Outcome
 from laser_slam.benchmarks.sources import Sources
-from laser_slam.benchmarks.table import Table
+from laser_slam.benchmarks.table import Column, Table
 
 OURS = "this run"
 NO_NUMBER = "-"
@@ -42,24 +42,33 @@ def as_markdown(table: Table, grids: Sequence[Grid], outcomes: Sequence[Outcome]
 
 
 def as_csv(name: str, grids: Sequence[Grid]) -> str:
-    """Write one line for each number, with what is to know of it."""
+    """Write one line for each number, with what is to know of it.
+
+    After a mean comes each of its sequences that has a number, and no column for itself.
+    """
     out = io.StringIO()
     lines = csv.writer(out, lineterminator="\n")
     lines.writerow(CSV_HEADER)
     for grid in grids:
         for row in grid.rows:
+            place = [name, grid.title, row.setting or row.name, row.backbone]
             for column, cell in zip(grid.columns, row.cells, strict=True):
-                place = [name, grid.title, row.setting or row.name, row.backbone]
                 counts = ["", ""] if row.source else [cell.num, cell.num_wanted]
-                what = [
-                    row.sequence or column.over,
-                    column.name,
-                    column.measure,
-                    _value(cell),
-                    *counts,
-                ]
-                lines.writerow([*place, *what, row.source or OURS, _told(cell)])
+                what = [column.name, column.measure, _value(cell), *counts]
+                over = row.sequence or column.over
+                lines.writerow([*place, over, *what, row.source or OURS, _told(cell)])
+                for sequence, value in _single(grid, column, cell):
+                    what = [column.name, column.measure, value, 1, 1]
+                    why = cell.reasons.get(sequence, "")
+                    lines.writerow([*place, sequence, *what, OURS, why])
     return out.getvalue()
+
+
+def _single(grid: Grid, column: Column, cell: Cell) -> Iterator[tuple[str, float]]:
+    """Give the sequences of a mean that have a number of their own nowhere else."""
+    shown = {other.over for other in grid.columns if other.measure == column.measure}
+    if cell.num_wanted > 1:
+        yield from ((name, value) for name, value in cell.each.items() if name not in shown)
 
 
 def _value(cell: Cell) -> float | str:
