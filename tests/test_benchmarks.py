@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from quick_runs import leave_pictures_out
 from typer.testing import CliRunner, Result
 
 from laser_slam.backbones.simulated import SimulatedBackbone
@@ -48,8 +49,7 @@ SIMULATED = [
 
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("draw_findings", "stages_picture"):
-        monkeypatch.setattr(f"laser_slam.pipeline.{name}", lambda *_: None)
+    leave_pictures_out(monkeypatch)
     monkeypatch.delenv("LASER_SLAM_DATA", raising=False)
 
 
@@ -67,8 +67,7 @@ def finished(data: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     """A table of two rows, run by the command line."""
     out = tmp_path_factory.mktemp("bench") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("draw_findings", "stages_picture"):
-            patch.setattr(f"laser_slam.pipeline.{name}", lambda *_: None)
+        leave_pictures_out(patch)
         return out, bench(data, out)
 
 

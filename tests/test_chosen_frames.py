@@ -298,7 +298,7 @@ def test_only_what_is_bent_is_straightened(
     same = np.array_equal(next(as_it_is.frames()).image, next(straight.frames()).image)  # type: ignore[arg-type]
     assert same == (key != "bonn")
     assert bool(straight.info.files) == (key != "bonn")
-    assert as_it_is.info.intrinsics_source != "lens distortion taken out"
+    assert not as_it_is.info.intrinsics_source.endswith("taken out")
 
 
 def test_waymo_says_of_its_lens_what_the_files_say(tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from quick_runs import leave_pictures_out
 from rendered import RenderedDrive
 from tracks import Drive
 
-import laser_slam.pipeline
 from laser_slam.backbones.base import Backbone
 from laser_slam.backbones.classical import ClassicalBackbone
 from laser_slam.backbones.classical.prediction import follow_turn, without_depth
@@ -651,8 +651,7 @@ def test_a_run_over_all_that_may_happen_has_a_pose_for_every_frame(
     short_drive: RenderedDrive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The pipeline leaves out what stands and what is dark, so only the cut must be bridged."""
-    for name in ("draw_findings", "stages_picture"):
-        monkeypatch.setattr(laser_slam.pipeline, name, lambda *_: None)
+    leave_pictures_out(monkeypatch)
     dataset = Eventful(eventful(short_drive), short_drive.intrinsics)
     settings = {"windows": {"size": 8, "overlap": 3}, "calibration": {"keyframes": 0}}
     config = Config.model_validate(

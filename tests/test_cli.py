@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from corridor import SIZE, TrueBackbone, true_intrinsics, true_pose, view
 from PIL import Image
+from quick_runs import leave_pictures_out
 from typer.testing import CliRunner, Result
 
 from laser_slam import __version__
@@ -55,8 +56,7 @@ def known_backbones(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def cheap_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("draw_findings", "stages_picture"):
-        monkeypatch.setattr(f"laser_slam.pipeline.{name}", lambda *_: None)
+    leave_pictures_out(monkeypatch)
 
 
 @pytest.fixture(scope="module")

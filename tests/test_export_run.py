@@ -35,11 +35,11 @@ from photographed import (
 )
 from PIL import Image as Pillow
 from plyfile import PlyData
+from quick_runs import leave_pictures_out
 from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
 import laser_slam.export.mesh
-import laser_slam.pipeline
 from laser_slam import dependencies
 from laser_slam.camera import intrinsics_matrix
 from laser_slam.cli import app
@@ -80,8 +80,7 @@ CONFIG = load_config(
 def run_over(
     folder: Path, photos: Path | None, eye: TrueEye, monkeypatch: pytest.MonkeyPatch
 ) -> Path:
-    for name in ("draw_findings", "stages_picture"):
-        monkeypatch.setattr(laser_slam.pipeline, name, lambda *_, **__: None)
+    leave_pictures_out(monkeypatch)
     dataset = PhotographedCorridor(photos, NUM_FRAMES, eye.distortion)
     if photos is not None:
         dataset.write_files()

@@ -10,6 +10,7 @@ import pytest
 from boards import Boards, Window
 from corridor import Corridor, TrueBackbone
 from numpy.typing import NDArray
+from quick_runs import leave_pictures_out
 
 import laser_slam.pipeline
 from laser_slam.config import Config, LayersConfig, SegmentationConfig, load_config
@@ -175,8 +176,7 @@ class BendingBackbone(TrueBackbone):
 def no_pictures() -> Iterator[None]:
     """Leave out what takes seconds and is drawn in other tests."""
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("draw_findings", "stages_picture"):
-            patch.setattr(laser_slam.pipeline, name, lambda *_: None)
+        leave_pictures_out(patch)
         yield
 
 

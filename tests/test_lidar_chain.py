@@ -11,10 +11,10 @@ import pytest
 import scans
 from corridor import TrueBackbone
 from numpy.typing import NDArray
+from quick_runs import leave_pictures_out
 from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
-import laser_slam.pipeline
 from laser_slam.backbones import BACKBONES
 from laser_slam.cli import app
 from laser_slam.dependencies import import_kiss_icp
@@ -87,8 +87,7 @@ def compare(root: Path, backbone: Callable[[object], StreetBackbone]) -> tuple[s
     """Map the street, and compare with its scans; return what is said and the folder."""
     out = root / backbone.__name__
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("draw_findings", "stages_picture"):
-            patch.setattr(laser_slam.pipeline, name, lambda *_: None)
+        leave_pictures_out(patch)
         patch.setitem(BACKBONES, "classical", f"{__name__}:{backbone.__name__}")
         settings = [part for setting in SETTINGS for part in ("--set", setting)]
         invoke("kitti", 0, "--root", root, "--out", out / "run", "--quiet", *settings)

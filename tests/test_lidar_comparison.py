@@ -21,10 +21,10 @@ from corridor import (
 )
 from image_files import write_png
 from numpy.typing import NDArray
+from quick_runs import leave_pictures_out
 from scans import beams, cam0_from_velo, write_scan
 from typer.testing import CliRunner
 
-import laser_slam.pipeline
 from laser_slam.backbones import BACKBONES
 from laser_slam.cli import app
 from laser_slam.config import load_config
@@ -86,8 +86,7 @@ def true_path(frames: Iterable[int] = SCANNED) -> Trajectory:
 
 def judge(folder: Path, backbone: TrueBackbone, velodyne: Velodyne) -> dict[str, Any]:
     with pytest.MonkeyPatch.context() as patch:
-        for name in ("draw_findings", "stages_picture"):
-            patch.setattr(laser_slam.pipeline, name, lambda *_: None)
+        leave_pictures_out(patch)
         Pipeline(Corridor(NUM, with_truth=False), CONFIG, folder, backbone=backbone).run()
     out = folder.with_name(f"{folder.name}-lidar")
     out.mkdir()
@@ -151,8 +150,7 @@ def test_the_kitti_command_scores_depth_by_the_scans_beside_the_images(
     text = [f"{name}: {' '.join(map(str, row.ravel()))}\n" for name, row in rows.items()]
     (folder / "calib.txt").write_text("".join(text))
     (folder / "times.txt").write_text("".join(f"{0.1 * frame}\n" for frame in range(NUM)))
-    for name in ("draw_findings", "stages_picture"):
-        monkeypatch.setattr(laser_slam.pipeline, name, lambda *_: None)
+    leave_pictures_out(monkeypatch)
     monkeypatch.setitem(BACKBONES, "classical", f"{__name__}:true_backbone")
     settings = ("windows.size=8", "windows.min_parallax_px=0.2", f"run.samples={NUM}")
     command = ["kitti", "0", "--root", str(tmp_path), "--out", str(tmp_path / "run"), "--quiet"]

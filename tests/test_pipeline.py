@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from corridor import Corridor, TrueBackbone
+from quick_runs import leave_pictures_out
 
 import laser_slam.pipeline
 from laser_slam.config import Config, load_config
@@ -39,8 +40,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Results:
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out what takes seconds and is drawn in other tests."""
-    for name in ("draw_findings", "stages_picture"):
-        monkeypatch.setattr(laser_slam.pipeline, name, lambda *_: None)
+    leave_pictures_out(monkeypatch)
 
 
 def run(

@@ -16,9 +16,9 @@ import pytest
 import yaml
 from corridor import Corridor, TrueBackbone
 from numpy.typing import NDArray
+from quick_runs import leave_pictures_out
 from typer.testing import CliRunner
 
-import laser_slam.pipeline
 from laser_slam.bookkeeping import StageClock
 from laser_slam.cli import app
 from laser_slam.config import Config, load_config
@@ -44,8 +44,7 @@ MADE = ("trajectory_kitti.txt", "map.ply", "graph.g2o")
 
 @pytest.fixture(autouse=True)
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("draw_findings", "stages_picture"):
-        monkeypatch.setattr(laser_slam.pipeline, name, lambda *_: None)
+    leave_pictures_out(monkeypatch)
 
 
 @pytest.fixture(scope="module")

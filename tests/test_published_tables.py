@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from layouts import Scene
 from numpy.typing import NDArray
+from quick_runs import leave_pictures_out
 
 from laser_slam.benchmarks import Bench, Material, Setting, fill_grids, load_table
 from laser_slam.camera import intrinsics_matrix, unproject
@@ -236,8 +237,7 @@ def score(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Callable[[str, str, int], dict[str, float]]:
     """Run one row of a table on one sequence; give the values by their measures."""
-    for name in ("draw_findings", "stages_picture", "write_report_page"):
-        monkeypatch.setattr(f"laser_slam.pipeline.{name}", lambda *_: None)
+    leave_pictures_out(monkeypatch, page=True)
 
     def run(name: str, sequence: str, kind: int) -> dict[str, float]:
         case = CASES[name, sequence]

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from corridor import TrueBackbone, view
 from PIL import Image
+from quick_runs import leave_pictures_out
 from typer.testing import CliRunner
 
 from laser_slam.backbones import BACKBONES
@@ -23,8 +24,7 @@ def test_the_python_example_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Word by word, on images that lie where it expects them."""
-    for name in ("draw_findings", "stages_picture"):
-        monkeypatch.setattr(f"laser_slam.pipeline.{name}", lambda *_: None)
+    leave_pictures_out(monkeypatch)
     monkeypatch.setitem(BACKBONES, "classical", f"{__name__}:true_backbone")
     monkeypatch.chdir(tmp_path)
     (tmp_path / "drive").mkdir()

@@ -16,10 +16,10 @@ import PIL.Image
 import pytest
 from browser import Browser
 from corridor import Corridor, TrueBackbone
+from quick_runs import leave_pictures_out
 from ring import NUM_FRAMES, TIMES_S, Drift, black, chain, prediction_of, ring_pose, true_link
 from typer.testing import CliRunner
 
-import laser_slam.pipeline
 from laser_slam.cli import app
 from laser_slam.closures import ClosureRecord
 from laser_slam.config import load_config
@@ -477,8 +477,7 @@ def test_a_folder_without_report_is_refused(
 def test_a_run_and_a_new_truth_rewrite_the_page(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("draw_findings", "stages_picture"):
-        monkeypatch.setattr(laser_slam.pipeline, name, lambda *_: None)
+    leave_pictures_out(monkeypatch)
     Pipeline(Corridor(36), CONFIG, tmp_path / "run", backbone=TrueBackbone()).run()
     page = page_of(tmp_path / "run")
     assert "corridor" in page.text
@@ -508,8 +507,7 @@ def test_a_missing_page_is_written_again_without_a_truth(bare: Path) -> None:
 def test_another_truth_moves_the_windows_scales_into_its_metres(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("draw_findings", "stages_picture"):
-        monkeypatch.setattr(laser_slam.pipeline, name, lambda *_: None)
+    leave_pictures_out(monkeypatch)
     folder = tmp_path / "run"
     Pipeline(Corridor(36), CONFIG, folder, backbone=TrueBackbone()).run()
     row = {"distance": 2.0, "scale": 3.0, "scale_without_loops": 4.0, "true_scale": 3.1}

@@ -10,9 +10,9 @@ import pytest
 from corridor import SIZE, TrueBackbone, true_intrinsics, true_pose, view
 from image_files import write_png
 from layouts import FIRST_DEPTH, LAYOUTS, counts, open_layout, scanned, write_exr, write_layout
+from quick_runs import leave_pictures_out
 from typer.testing import CliRunner
 
-import laser_slam.pipeline
 from laser_slam.camera import rays, resize_intrinsics
 from laser_slam.cli import app
 from laser_slam.config import load_config
@@ -127,8 +127,7 @@ def test_the_page_on_data_sets_has_a_row_for_each() -> None:
 def test_a_run_with_a_backbone_that_knows_scores_next_to_nothing(
     key: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("draw_findings", "stages_picture"):
-        monkeypatch.setattr(laser_slam.pipeline, name, lambda *_: None)
+    leave_pictures_out(monkeypatch)
     config = load_config(
         assignments=["windows.size=8", "windows.overlap=3", "windows.min_parallax_px=0.2"]
     )

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from corridor import SIZE, Corridor, true_intrinsics, true_pose, view
 from numpy.typing import NDArray
+from quick_runs import leave_pictures_out
 from rendered import RenderedDrive
 from scipy.stats import spearmanr
 
@@ -583,8 +584,7 @@ def run_report(folder: Path, *settings: str) -> dict[str, object]:
 def test_a_whole_run_maps_the_corridor_and_says_what_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("draw_findings", "stages_picture"):
-        monkeypatch.setattr(f"laser_slam.pipeline.{name}", lambda *_: None)
+    leave_pictures_out(monkeypatch)
     exact = run_report(
         tmp_path / "exact",
         *[f"backbone.simulated.{name}={value}" for name, value in NOTHING.items()],
