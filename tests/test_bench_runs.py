@@ -16,6 +16,7 @@ import yaml
 from quick_runs import leave_pictures_out
 from typer.testing import CliRunner, Result
 
+from laser_slam.backbones import BACKBONES
 from laser_slam.benchmarks import Bench, Material, Setting, load_table, parse_settings
 from laser_slam.benchmarks.claims import TakenError, claimed
 from laser_slam.benchmarks.outcome import NOT_YET
@@ -108,6 +109,19 @@ def test_a_network_is_made_once_for_all_runs(
     assert len(made) == 1
     assert used == made * 4
     assert {one.reason for one in found} == {"RuntimeError: CUDA out of memory"}
+
+
+def test_a_backbone_of_ones_own_needs_no_settings(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(BACKBONES, "mine", f"{__name__}:Mine")
+    found = work(data, tmp_path).run([PLAIN, Setting("mine", (*SIMULATED, "backbone.name=mine"))])
+    assert [one.reason for one in found] == [None, None, "mine: no weights", "mine: no weights"]
+
+
+class Mine:
+    def __init__(self, config: object) -> None:
+        raise WeightsError("mine: no weights")
 
 
 def test_a_bug_in_one_run_is_its_reason_with_a_traceback_and_the_others_go_on(

@@ -274,6 +274,9 @@ def test_a_wrong_setting_is_refused(text: str, words: str) -> None:
 def test_rows_that_would_share_a_folder_are_refused() -> None:
     with pytest.raises(ConfigError, match="given twice"):
         parse_settings(["w/o LSA=", "w o LSA="], load_table("kitti"))
+    table = parse_table("{title: t, rows: {a b: [], a-b: []}, sequences: {}, blocks: []}")
+    with pytest.raises(ConfigError, match="'a b' is given twice, or shares the folder a-b"):
+        parse_settings([], table)
 
 
 @pytest.mark.parametrize(

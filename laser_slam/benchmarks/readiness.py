@@ -65,7 +65,7 @@ class Readiness:
         """
         if config.name in {*ON_CPU, REPLAY}:
             return None
-        key = config.name + _as_text(getattr(config, config.name))
+        key = _as_text(config)
         if self._made is None or self._made[0] != key:
             self._made = None  # its memory is needed
             self._made = key, make_backbone(config)

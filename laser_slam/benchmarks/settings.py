@@ -36,14 +36,16 @@ def parse_settings(given: Sequence[str], table: Table) -> list[Setting]:
     >>> parse_settings(["short=windows.size=10,windows.overlap=3"], load_table("kitti"))
     [Setting(name='short', assignments=('windows.size=10', 'windows.overlap=3'))]
     """
-    if not given:
-        return [Setting(name, assignments) for name, assignments in table.rows.items()]
-    # A row may be in several groups.
-    settings = list(dict.fromkeys(setting for text in given for setting in _parse(text, table)))
+    every = [Setting(name, assignments) for name, assignments in table.rows.items()]
+    asked = [setting for text in given for setting in _parse(text, table)]
+    settings = list(dict.fromkeys(asked if given else every))  # a row may be in several groups
     folders = [setting.folder for setting in settings]
-    for name in folders:
-        if folders.count(name) > 1:
-            raise ConfigError(f"--setting {name} is given twice, or looks so; name it otherwise")
+    for setting in settings:
+        if folders.count(setting.folder) > 1:
+            raise ConfigError(
+                f"the row '{setting.name}' is given twice, or shares the folder {setting.folder} "
+                "with another; name it otherwise"
+            )
     return settings
 
 
