@@ -222,6 +222,18 @@ def test_two_processes_share_the_work(
     assert all(one.scores for one in work(data, tmp_path).run([PLAIN]))
 
 
+def test_what_is_done_is_read_by_several_at_once(data: Path, tmp_path: Path) -> None:
+    """So that processes that start together do not miss the numbers that are there."""
+    first = work(data, tmp_path).run([PLAIN])
+    with claimed(tmp_path / "plain" / "03", to_read=True):
+        assert work(data, tmp_path).run([PLAIN]) == first
+        lean = work(data, tmp_path, is_lean=True)
+        assert "another process" in str(lean.run([PLAIN])[0].reason)  # for windows are to go
+    assert lean.run([PLAIN]) == first
+    with claimed(tmp_path / "plain" / "03", to_read=True):
+        assert lean.run([PLAIN]) == first
+
+
 def test_what_another_process_finishes_meanwhile_is_taken(data: Path, tmp_path: Path) -> None:
     done = threading.Event()
     started = threading.Event()

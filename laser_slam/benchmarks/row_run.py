@@ -6,6 +6,7 @@ import json
 import logging
 import re
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -107,7 +108,7 @@ class RowRun:
         """
         try:
             dataset = opened.open(self.place.material, self.spec, self.config)
-            with claimed(self.folder):
+            with claimed(self.folder, to_read=self._is_done()):
                 scores = self._scores(dataset, readiness, on_progress)
         except TakenError:
             raise
@@ -130,6 +131,17 @@ class RowRun:
                 reason = re.sub(rf"(?<![\w./-]){re.escape(str(place))}(?![\w-])", word, reason)
         return Outcome(*self.key, reason=reason, backbone=self.config.backbone.name)
 
+    def _is_done(self) -> bool:
+        """Tell whether it is finished, scored and, if it shall be, lean: only read from now on."""
+        if not self.is_finished or self._unscored(read_scores(self.folder / SCORES)):
+            return False
+        return not (self.place.is_lean and any((self.folder / name).exists() for name in BULK))
+
+    def _unscored(self, scores: Mapping[str, Any]) -> list[str]:
+        """Return the protocols that columns want and that have not been worked out."""
+        wanted = {MEASURES[name].protocol for name in self.place.table.measures_of(self.name)}
+        return sorted(wanted - scores.keys() - {RUN})
+
     def _scores(
         self, dataset: Dataset, readiness: Readiness, on_progress: Progress
     ) -> dict[str, Any]:
@@ -139,8 +151,7 @@ class RowRun:
         else:
             self._run(dataset, config, readiness, on_progress)
         scores = read_scores(self.folder / SCORES)
-        wanted = {MEASURES[name].protocol for name in self.place.table.measures_of(self.name)}
-        for protocol in sorted(wanted - scores.keys() - {RUN}):
+        for protocol in self._unscored(scores):
             self._refuse_lean(protocol)
             scores[protocol] = PROTOCOLS[protocol](self.folder, dataset)
             kept = {"version": PROTOCOL_VERSION, "scores": scores}
