@@ -361,6 +361,19 @@ def test_a_scan_that_is_cut_off_is_known_before_any_is_tracked(
     assert not out.exists()
 
 
+@needs_kiss_icp
+@pytest.mark.parametrize(
+    ("out", "words"), [(".", "is not empty; choose"), ("file/out", "Not a directory; choose")]
+)
+def test_a_folder_that_cannot_be_used_is_one_line(tmp_path: Path, out: str, words: str) -> None:
+    root = scans.write_kitti(tmp_path / "kitti", 3)
+    (tmp_path / "file").touch()
+    command = ["lidar", "kitti", "00", "--root", str(root), "--out", str(tmp_path / out)]
+    result = CliRunner().invoke(app, [*command, "--quiet"])
+    assert result.exit_code == 1
+    assert f"{words} another with --out" in result.stderr
+
+
 def test_a_raw_drive_with_an_empty_folder_of_scans_is_read_without_depth(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -20,6 +20,7 @@ from laser_slam.lidar.comparison import compare_with_run, refuse_other_input
 from laser_slam.lidar.tracking import track_camera
 from laser_slam.results import write_report
 from laser_slam.store import new_run_folder
+from laser_slam.store.files import make_folder
 from laser_slam.types import Trajectory
 
 REPORT_FILE = "lidar.json"
@@ -113,12 +114,7 @@ def _describe(dataset: LidarDataset, velodyne: Velodyne, path: Trajectory) -> di
 
 def _new_folder(out: Path | None, name: str) -> Path:
     folder = out or new_run_folder(f"{name}-lidar")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise RunFolderError(f"{folder} is not empty; choose another with --out")
-    except OSError as error:
-        raise RunFolderError(
-            f"cannot use {folder}: {error.strerror}; choose another with --out"
-        ) from error
+    make_folder(folder)
+    if any(folder.iterdir()):
+        raise RunFolderError(f"{folder} is not empty; choose another with --out")
     return folder
