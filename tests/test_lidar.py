@@ -448,9 +448,9 @@ def test_a_date_stands_for_its_published_calibration(
         assert ahead[2] > 0.999  # nearly where the camera looks
         assert min(-left[0], -up[1]) > 0.999
         assert np.abs(rig.cam_from_velo[:3, 3] - [0, -0.07, -0.3]).max() < 0.1
-    for nine in (day.turn, day.rectify):
-        turn = np.reshape(nine, (3, 3))
-        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=2e-6)
+    for nine in (day.rotation_cam0_from_velo, day.rectified_from_cam0):
+        R = np.reshape(nine, (3, 3))
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=2e-6)
     with pytest.raises(DatasetError, match="are 100x100, rectified ones of"):
         raw_rig(Path(date), "image_02", (100, 100), "")
 

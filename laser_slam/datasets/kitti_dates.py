@@ -9,6 +9,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from laser_slam.camera import intrinsics_matrix
+
 Array = NDArray[np.float64]
 
 
@@ -18,25 +20,25 @@ class Day:
 
     Attributes:
         size: (width, height) of rectified images, in pixels.
-        focal: of all rectified cameras: focal length, and x and y of the principal point.
-        color: fourth column of ``P_rect_02``.
-        rectify: ``R_rect_00``, row by row.
-        turn: ``R`` of ``calib_velo_to_cam.txt``, row by row.
-        move: ``T`` of the same file.
+        camera: f, cx, cy of all rectified cameras, in pixels.
+        color: fourth column of ``P_rect_02``: pixels times metres twice, then metres.
+        rectified_from_cam0: ``R_rect_00``, row by row.
+        rotation_cam0_from_velo: ``R`` of ``calib_velo_to_cam.txt``, row by row; before rectification.
+        translation_cam0_from_velo: ``T`` of the same file, metres.
     """
 
     size: tuple[int, int]
-    focal: tuple[float, float, float]
+    camera: tuple[float, float, float]
     color: tuple[float, float, float]
-    rectify: tuple[float, ...]
-    turn: tuple[float, ...]
-    move: tuple[float, float, float]
+    rectified_from_cam0: tuple[float, ...]
+    rotation_cam0_from_velo: tuple[float, ...]
+    translation_cam0_from_velo: tuple[float, float, float]
 
     def cameras(self) -> dict[str, Array]:
         """Return the rows of ``calib_cam_to_cam.txt``."""
-        f, x, y = self.focal
-        K = np.array([[f, 0, x], [0, f, y], [0, 0, 1]])
-        rows = {"R_rect_00": np.array(self.rectify)}
+        f, cx, cy = self.camera
+        K = intrinsics_matrix(f, f, cx, cy)
+        rows = {"R_rect_00": np.array(self.rectified_from_cam0)}
         for number, column in (("00", (0.0, 0.0, 0.0)), ("02", self.color)):
             rows[f"S_rect_{number}"] = np.array(self.size, np.float64)
             rows[f"P_rect_{number}"] = np.column_stack([K, column]).ravel()
@@ -44,7 +46,10 @@ class Day:
 
     def scanner(self) -> dict[str, Array]:
         """Return the rows of ``calib_velo_to_cam.txt``."""
-        return {"R": np.array(self.turn), "T": np.array(self.move)}
+        return {
+            "R": np.array(self.rotation_cam0_from_velo),
+            "T": np.array(self.translation_cam0_from_velo),
+        }
 
 
 # fmt: off
