@@ -23,7 +23,7 @@ class Day:
         camera: f, cx, cy of all rectified cameras, in pixels.
         color: fourth column of ``P_rect_02``: pixels times metres twice, then metres.
         rectified_from_cam0: ``R_rect_00``, row by row.
-        rotation_cam0_from_velo: ``R`` of ``calib_velo_to_cam.txt``, row by row; before rectification.
+        rotation_cam0_from_velo: ``R`` of ``calib_velo_to_cam.txt``, row by row; not rectified.
         translation_cam0_from_velo: ``T`` of the same file, metres.
     """
 
