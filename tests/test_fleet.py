@@ -59,19 +59,14 @@ def begin(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory: pytest.TempPathFactory, cluster: None) -> dict[str, bytes]:
-    """Predict stretch by stretch in one process: what any fleet must leave.
-
-    Twice, for code that a process has compiled itself rounds otherwise than what it finds
-    compiled, as the workers will.
-    """
+    """Predict stretch by stretch in one process: what any fleet must leave."""
     source = job(tmp_path_factory.mktemp("alone") / "windows").source
     source.open()
-    windows, files = list(source.cut()), []
-    for _ in range(2):
-        with Crew(ONE, CONFIG.backbone) as crew:
-            stretches = [windows[first : first + 2] for first in range(0, len(windows), 2)]
-            done = crew.predict(stretches, source.rectifier.intrinsics)
-            files = sorted((stretch[0].index, contents) for stretch, contents in done)
+    windows = list(source.cut())
+    with Crew(ONE, CONFIG.backbone) as crew:
+        stretches = [windows[first : first + 2] for first in range(0, len(windows), 2)]
+        done = crew.predict(stretches, source.rectifier.intrinsics)
+        files = sorted((stretch[0].index, contents) for stretch, contents in done)
     in_order = [content for _, contents in files for content in contents]
     return {f"{index:06d}.npz": content for index, content in enumerate(in_order)}
 
