@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -140,8 +140,17 @@ def test_a_truncated_png_in_the_middle_is_warned_of_and_the_run_goes_on(
     assert len(lines) == NUM_FRAMES
 
 
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Let SIGINT interrupt: shells make programs that they start in the background deaf to it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c", "cheap_pictures")
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on(
-    photos: Path, tmp_path: Path, cheap_pictures: None, monkeypatch: pytest.MonkeyPatch
+    photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "run"
     command = ["images", photos, *FOV, "--out", folder, "--quiet", "--backbone", "interrupted"]
