@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -163,7 +164,7 @@ def test_a_real_room_is_scored_as_open3d_does() -> None:
 
 
 def assert_agrees_with_open3d(maps: list[PointMap]) -> None:
-    """Compare with Open3D's own distances, after its own ICP."""
+    """Compare with Open3D's own distances and normals, after its own ICP."""
     open3d = import_open3d()
     found, truth = (
         np.concatenate([part.reshape(-1, 3) for part in parts])
@@ -178,7 +179,10 @@ def assert_agrees_with_open3d(maps: list[PointMap]) -> None:
     there, back = (
         np.asarray(one.compute_point_cloud_distance(other)) for one, other in (clouds, clouds[::-1])
     )
-    mine = evaluate_points(maps, PointProtocol(has_normals=False))
+    cosines = [nearest_cosines(one, other) for one, other in (clouds, clouds[::-1])]
+    mine = evaluate_points(maps, EVERYTHING)
+    assert mine.nc_mean == pytest.approx(np.mean([each.mean() for each in cosines]), abs=1e-6)
+    assert mine.nc_median == pytest.approx(np.mean([np.median(each) for each in cosines]), abs=1e-6)
     assert mine.acc_mean_m == pytest.approx(there.mean(), abs=1e-6)
     assert mine.acc_median_m == pytest.approx(np.median(there), abs=1e-6)
     assert mine.comp_mean_m == pytest.approx(back.mean(), abs=1e-6)
@@ -186,8 +190,18 @@ def assert_agrees_with_open3d(maps: list[PointMap]) -> None:
     assert mine.icp_fitness == pytest.approx(result.fitness, abs=1e-6)
 
 
+def nearest_cosines(cloud: Any, other: Any) -> Array:
+    """Return |cosine| of each point's normal and its nearest one's, both as Open3D finds them."""
+    for each in (cloud, other):
+        each.estimate_normals()
+    tree = import_open3d().geometry.KDTreeFlann(other)
+    nearest = [tree.search_knn_vector_3d(point, 1)[1][0] for point in np.asarray(cloud.points)]
+    normals = np.asarray(cloud.normals), np.asarray(other.normals)[nearest]
+    return np.asarray(np.abs((normals[0] * normals[1]).sum(axis=1)))
+
+
 @pytest.mark.parametrize("seed", range(3))
-def test_distances_agree_with_open3d(seed: int) -> None:
+def test_scores_agree_with_open3d(seed: int) -> None:
     assert_agrees_with_open3d(noisy_maps(seed))
 
 
