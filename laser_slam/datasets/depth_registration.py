@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.camera import rays
+from laser_slam.camera import project, rays
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
@@ -30,15 +30,28 @@ def register_depth(
     known = np.isfinite(depth)
     points = rays(depth_intrinsics, *depth.shape)[known] * depth[known].astype(np.float64)[:, None]
     points = points @ cam_from_depth_cam[:3, :3].T + cam_from_depth_cam[:3, 3]
+    seen = nearest_depth(points, intrinsics, (depth.shape[0], depth.shape[1]))
+    return np.where(np.isfinite(seen), seen, np.float32(np.nan))
+
+
+def nearest_depth(points: Array, intrinsics: Array, size: tuple[int, int]) -> Depth:
+    """Let each point fall into its nearest pixel; of several in one pixel the nearest stays.
+
+    Args:
+        points: (N, 3) in metres, in the camera's axes.
+        intrinsics: (3, 3) of the camera.
+        size: (height, width) of its images.
+
+    Returns:
+        (height, width) z in metres; infinite: nothing fell there.
+    """
     points = points[points[:, 2] > 0]
-    pixels = points @ intrinsics.T
-    columns, rows = _nearest(pixels[:, :2] / pixels[:, 2:]).T
-    height, width = depth.shape
+    columns, rows = _nearest(project(points, intrinsics).clip(-1e6, 1e6)).T
+    height, width = size
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    nearest = np.full(depth.shape, np.inf, np.float32)
-    where = rows[inside], columns[inside]
-    np.minimum.at(nearest, where, points[inside, 2].astype(np.float32))
-    return np.where(np.isfinite(nearest), nearest, np.float32(np.nan))
+    nearest = np.full(size, np.inf, np.float32)
+    np.minimum.at(nearest, (rows[inside], columns[inside]), points[inside, 2].astype(np.float32))
+    return nearest
 
 
 def look_up_depth(

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from laser_slam.camera import project
+from laser_slam.datasets.depth_registration import nearest_depth
 from laser_slam.errors import DatasetError
 
 Array = NDArray[np.float64]
@@ -182,12 +182,7 @@ def project_scan(points: Array, rig: Rig) -> Depth:
         (H, W) depth z in metres, NaN: unknown, as it is in most pixels.
     """
     seen = points @ rig.cam_from_velo[:3, :3].T + rig.cam_from_velo[:3, 3]
-    seen = seen[seen[:, 2] > 0]
-    pixels = np.rint(project(seen, rig.intrinsics)).clip(-1e6, 1e6).astype(np.int64)
-    height, width = rig.size
-    inside = ((pixels >= 0) & (pixels < [width, height])).all(axis=1)
-    depth = np.full(rig.size, np.inf, np.float32)
-    np.minimum.at(depth, (pixels[inside, 1], pixels[inside, 0]), seen[inside, 2])
+    depth = nearest_depth(seen, rig.intrinsics, rig.size)
     is_hidden = _is_hidden(depth) | _is_behind_outline(depth, rig)
     depth[~np.isfinite(depth) | is_hidden] = np.nan
     return depth
@@ -195,19 +190,10 @@ def project_scan(points: Array, rig: Rig) -> Depth:
 
 def _is_hidden(depth: Depth) -> NDArray[np.bool_]:
     """Tell which pixels have nearer ones both above and below; infinite: nothing is known."""
-    kernel = np.ones((HIDING_HEIGHT_PX + 1, 2 * HIDING_SIDE_PX + 1), np.uint8)
+    size = HIDING_HEIGHT_PX + 1, 2 * HIDING_SIDE_PX + 1
     limit = HIDING_RATIO * depth
     rows = (HIDING_HEIGHT_PX, 0)  # the kernel ends, or begins, in the pixel's own row
-    above, below = (
-        cv2.erode(
-            depth,
-            kernel,
-            anchor=(HIDING_SIDE_PX, row),
-            borderType=cv2.BORDER_CONSTANT,
-            borderValue=float(np.finfo(np.float32).max),
-        )
-        for row in rows
-    )
+    above, below = (_least_around(depth, size, (HIDING_SIDE_PX, row)) for row in rows)
     return np.asarray((above < limit) & (below < limit))
 
 
@@ -226,12 +212,20 @@ def _is_behind_outline(depth: Depth, rig: Rig) -> NDArray[np.bool_]:
         aside = np.array([HIDING_SIDE_PX, 0])
         low, high = ends.min(axis=0) - aside, ends.max(axis=0) + aside
         width, height = (high - low + 1).tolist()
-        nearest = cv2.erode(
-            band,
-            np.ones((height, width), np.uint8),
-            anchor=(int(-low[0]), int(-low[1])),
-            borderType=cv2.BORDER_CONSTANT,
-            borderValue=float(np.finfo(np.float32).max),
-        )
+        nearest = _least_around(band, (height, width), (int(-low[0]), int(-low[1])))
         out |= nearest < MUCH_NEARER * depth
     return out
+
+
+def _least_around(depth: Depth, size: tuple[int, int], anchor: tuple[int, int]) -> Depth:
+    """Return the least depth within (height, width) ``size``, in which (x, y) ``anchor`` lies."""
+    nothing = float(np.finfo(np.float32).max)
+    return np.asarray(
+        cv2.erode(
+            depth,
+            np.ones(size, np.uint8),
+            anchor=anchor,
+            borderType=cv2.BORDER_CONSTANT,
+            borderValue=nothing,
+        )
+    )
