@@ -50,7 +50,8 @@ class Place:
         table: that is run.
         material: where the data lie.
         out: holds a folder for each row, with a run's folder for each sequence.
-        is_shared: rows that cut the same windows map one prediction of them.
+        is_shared: rows that cut the same windows map one prediction of them; the backbone is then
+            not asked about loops.
         is_lean: of a run that is scored, ``BULK`` is removed.
     """
 

@@ -9,17 +9,15 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 from laser_slam.benchmarks.claims import TakenError, claimed
-from laser_slam.benchmarks.material import LastOpened, Material
+from laser_slam.benchmarks.material import LastOpened
 from laser_slam.benchmarks.notes import name_groups
 from laser_slam.benchmarks.outcome import NOT_YET, Outcome
 from laser_slam.benchmarks.pace import Pace, in_words
 from laser_slam.benchmarks.readiness import Readiness, refuse_unknown_names
 from laser_slam.benchmarks.row_run import Place, RowRun
 from laser_slam.benchmarks.settings import Setting
-from laser_slam.benchmarks.table import Table
 from laser_slam.bookkeeping import Progress, no_progress
 from laser_slam.config import Config, assigned, load_config
 from laser_slam.errors import ConfigError
@@ -40,28 +38,17 @@ def keep_nothing(_outcomes: list[Outcome]) -> None:
 
 
 @dataclass(frozen=True)
-class Bench:
+class Bench(Place):
     """A table to run.
 
     Attributes:
-        table: what is run and shown.
-        material: where the data lie.
-        out: holds a folder for each row, with a run's folder for each sequence.
         resolve: layers the user's settings between the ``section.key=value`` of the table, which
             lie below, and those of sequence and row, which lie above.
         only: names of sequences or groups; none: all.
-        is_shared: rows that cut the same windows map one prediction of them; the backbone is then
-            not asked about loops.
-        is_lean: of a run that is scored, only scores, paths and report are kept.
     """
 
-    table: Table
-    material: Material
-    out: Path
     resolve: Callable[[Sequence[str], Sequence[str]], Config] = plain_settings
     only: tuple[str, ...] = ()
-    is_shared: bool = False
-    is_lean: bool = False
 
     def sequences(self) -> list[str]:
         """Return the names of the sequences that are run, in the table's order.
@@ -88,9 +75,8 @@ class Bench:
         Raises:
             LaserSlamError: a setting is unknown, or a sequence that is asked for is none.
         """
-        place = Place(self.table, self.material, self.out, self.is_shared, self.is_lean)
         runs = [
-            RowRun(place, setting, name, self._config(setting, name))
+            RowRun(self, setting, name, self._config(setting, name))
             for name in self.sequences()
             for setting in settings
         ]

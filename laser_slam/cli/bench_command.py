@@ -149,7 +149,8 @@ def bench(
     settings = parse_settings(options.setting or [], chosen)
     only = tuple(part.strip() for part in (options.only or "").split(",") if part.strip())
     material = Material(options.data)
-    work = Bench(chosen, material, out, options.resolve, only, options.share, options.lean)
+    place = chosen, material, out, options.share, options.lean
+    work = Bench(*place, resolve=options.resolve, only=only)
     if options.list:
         _show_plan(work, settings)
         return
