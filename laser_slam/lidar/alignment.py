@@ -68,12 +68,14 @@ class Pieces:
     """A path in pieces that are aligned each for itself, so that no drift is between them.
 
     Attributes:
+        whole: ``lidar_from_world`` of the path in one piece.
         starts: (K,) first frame of each piece but the first.
         lidar_from_world: K + 1 similarities.
         frames: (N,) of the cameras that both paths have.
         centers: (N, 3) of these cameras in the run's world.
     """
 
+    whole: Sim3
     starts: NDArray[np.int64]
     lidar_from_world: tuple[Sim3, ...]
     frames: NDArray[np.int64]
@@ -116,7 +118,7 @@ def align_pieces(estimate: Trajectory, lidar: Trajectory) -> Pieces:
         rows = slice(first, last + 1)  # neighbours share a camera
         parts.append(_align_piece(_cut(estimate, rows), _cut(lidar, rows), whole))
     centers = np.array(estimate.world_from_cam[:, :3, 3])
-    return Pieces(lidar.frames[ends[1:-1]], tuple(parts), lidar.frames, centers)
+    return Pieces(whole, lidar.frames[ends[1:-1]], tuple(parts), lidar.frames, centers)
 
 
 def _align_piece(estimate: Trajectory, lidar: Trajectory, whole: Sim3) -> Sim3:

@@ -16,9 +16,10 @@ from laser_slam.datasets.base import Dataset
 from laser_slam.datasets.velodyne import Velodyne
 from laser_slam.errors import RunFolderError
 from laser_slam.evaluation import evaluate_trajectory
+from laser_slam.export import Source
 from laser_slam.exporting import ExportOptions
 from laser_slam.exporting.run import open_run
-from laser_slam.lidar.alignment import align_cameras, align_pieces, stretch_scales
+from laser_slam.lidar.alignment import align_pieces, stretch_scales
 from laser_slam.lidar.depth import ScannedPixels
 from laser_slam.lidar.surfaces import MOST_POINTS, compare_surfaces
 from laser_slam.predicting.manifest import read_identity
@@ -83,12 +84,14 @@ def compare_with_run(
         DatasetError: a scan is broken.
         DegenerateGeometryError: run and scans have no motion in common.
     """
-    path = open_run(run, ExportOptions()).trajectory
-    lidar_from_world, pieces = align_cameras(path, lidar), align_pieces(path, lidar)
+    opened = open_run(run, ExportOptions())
+    path = opened.trajectory
+    pieces = align_pieces(path, lidar)
+    lidar_from_world = pieces.whole
     _write_transform(folder / TRANSFORM_FILE, lidar_from_world)
     placed = replace(path, world_from_cam=lidar_from_world.apply_poses(path.world_from_cam))
     trajectory_picture(folder / PATHS_PICTURE, placed, lidar)
-    pixels = _scanned_pixels(run, velodyne, on_progress)
+    pixels = _scanned_pixels(run, opened, velodyne, on_progress)
     unit_m = lidar_from_world.scale
     cloud = TileFiles(run / TILES).cloud(MOST_POINTS)
     return {
@@ -106,14 +109,15 @@ def compare_with_run(
     }
 
 
-def _scanned_pixels(run: Path, velodyne: Velodyne, watch: Progress) -> ScannedPixels:
+def _scanned_pixels(
+    run: Path, opened: Source, velodyne: Velodyne, watch: Progress
+) -> ScannedPixels:
     """Read the depth of the keyframes that have a scan."""
     keyframes = set(load_keyframes(run).frames.tolist()) & set(velodyne.paths)
     config = load_config(None, run / "config.yaml")
     calibration = load_originals(run).calibration
     pixels = ScannedPixels(velodyne, calibration, config.fusion.min_confidence)
-    views = open_run(run, ExportOptions()).views(keyframes)
-    for done, view in enumerate(views, start=1):
+    for done, view in enumerate(opened.views(keyframes), start=1):
         pixels.add(view, len(keyframes))
         watch("comparing depth", done, len(keyframes))
     return pixels
